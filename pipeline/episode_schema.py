@@ -22,9 +22,9 @@ class ViewSpec(Frozen):
     """One camera: its name in MuJoCo and its key in LeRobot; its key here is its name in RLDS.
 
     Attributes:
-        lerobot_camera: what LeRobot's columns about the camera begin with; without ``image``, which lerobot takes for
-            the name of an image.
-        seen_from: the frame that the view's extrinsics lead to.
+        lerobot_camera: prefix of LeRobot's columns about the camera. It has no ``image``: lerobot treats columns with
+            that word as images.
+        seen_from: the frame into which the view's extrinsics transform.
     """
 
     camera: str
@@ -34,7 +34,7 @@ class ViewSpec(Frozen):
 
 
 class FrameSpec(Frozen):
-    """How every frame is stored."""
+    """Storage of every frame."""
 
     shape: tuple[int, int, int]
     dtype: str
@@ -43,7 +43,7 @@ class FrameSpec(Frozen):
 
 
 class MatrixSpec(Frozen):
-    """A matrix of a view's camera, the same at every step."""
+    """A matrix of a view's camera, constant over the episode."""
 
     shape: tuple[int, int]
     dtype: str
@@ -51,7 +51,7 @@ class MatrixSpec(Frozen):
 
 
 class MapSpec(Frozen):
-    """A picture of numbers for each step of a view, of the frame's size."""
+    """A map of numbers for each step of a view, as large as the frame."""
 
     dtype: str
     encoding: str
@@ -59,19 +59,19 @@ class MapSpec(Frozen):
 
 
 class DepthSpec(MapSpec):
-    """``unit_m`` is what a number of 1 means."""
+    """A depth map; a value of 1 means ``unit_m`` metres."""
 
     unit_m: float
 
 
 class PosesSpec(MatrixSpec):
-    """A row for each of ``instances``, at every step; units stand in the names of its columns."""
+    """A matrix per step with a row for each of ``instances``; the names of its columns contain the units."""
 
     names: tuple[str, ...]
 
 
 class VectorSpec(Frozen):
-    """A per-step vector; units stand in the names of its entries."""
+    """A per-step vector; the names of its entries contain the units."""
 
     shape: tuple[int]
     dtype: str
@@ -99,12 +99,13 @@ class GripperSpec(Frozen):
     close: float
 
     def others(self, commands: NDArray[np.floating]) -> set[float]:
-        """Those of some commands (T,) that, as datasets have them, are neither."""
-        return set(np.unique(commands.astype(np.float32)).tolist()) - {self.open, self.close}
+        """Return the values of ``commands`` (T,), rounded to float32 as in datasets, that are neither."""
+        values = np.unique(commands.astype(np.float32)).tolist()
+        return set(values) - {self.open, self.close}
 
 
 class ActionSpec(VectorSpec):
-    """Controller input; ``unit_m`` and ``unit_rad`` are what an entry of 1 asks for."""
+    """Controller input; an entry of 1 commands ``unit_m`` or ``unit_rad``."""
 
     range: tuple[float, float]
     unit_m: float
@@ -117,7 +118,7 @@ class EpisodeSchema(Frozen):
     """Names, shapes, units and signs that all writers read.
 
     Attributes:
-        provenance: what each episode says of itself, as the manifest's column of that name does, to its type.
+        provenance: name of each provenance column, as in the manifest, to its type.
     """
 
     fps_hz: int
@@ -140,30 +141,34 @@ class EpisodeSchema(Frozen):
 SCHEMA = EpisodeSchema.model_validate_json(schema_file("episode.json").read_text())
 
 MOTION = ("action", "state", "joint_state")
-"""What each step of an episode has in numbers."""
+"""Numeric arrays of an episode, with a row for each step."""
 
 MATRICES = ("intrinsics", "extrinsics")
-"""What each view of an episode has once."""
+"""Matrices that each view of an episode has once."""
 
 MAPS: tuple[Extra, ...] = ("depth", "segmentation")
-"""What each view of an episode has at each step on request."""
+"""Maps that each view of an episode has at each step on request."""
 
 OUTCOME: Mapping[str, Literal["bool", "string"]] = {"success": "bool", "reason": "string"}
-"""What each failure says of itself beside its provenance: ``success`` is false, ``reason`` as in the manifest."""
+"""Columns of failures in addition to provenance, to their types: ``success`` is false, ``reason`` is the manifest's."""
 
 
 def provenance_of(extras: Collection[Extra]) -> dict[str, str]:
-    """What each episode says of itself, to its type."""
-    return {**SCHEMA.provenance, **(OUTCOME if "outcome" in extras else {})}
+    """Return the names of the provenance columns of episodes with these extras, to their types."""
+    outcome = OUTCOME if "outcome" in extras else {}
+    return {**SCHEMA.provenance, **outcome}
 
 
 def named(extras: Collection[Extra]) -> bool:
-    """Whether episodes with these extras have a table of names."""
+    """Return whether episodes with these extras have a table of names."""
     return bool({"segmentation", "object_poses"} & set(extras))
 
 
 def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
-    """Refuse an episode that training would misread or choke on; it must have the ``extras`` beside the frames.
+    """Reject an episode that training would misread or fail on.
+
+    Args:
+        extras: the extras that the episode must have in addition to the frames.
 
     Raises:
         PipelineError: naming the episode and the field.
@@ -176,21 +181,22 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
         _check_array(episode, name, getattr(episode, name), getattr(SCHEMA, name), steps)
     low, high = SCHEMA.action.range
     if episode.action.min() < low or episode.action.max() > high:
-        found = f"spans [{episode.action.min():g}, {episode.action.max():g}]"
-        raise _fault(episode, "action", found, f"[{low:g}, {high:g}], as the controller clips it")
+        span = f"spans [{episode.action.min():g}, {episode.action.max():g}]"
+        raise _fault(episode, "action", span, f"[{low:g}, {high:g}], as the controller clips it")
     _check_frames(episode, steps)
     _check_geometry(episode, steps, extras)
     if not episode.instruction.strip() or "_" in episode.instruction:
-        # OpenVLA-OFT's loader spins for ever on an empty text; an underscore betrays a file name.
+        # OpenVLA-OFT's loader never returns on an empty text; an underscore indicates a file name.
         raise _fault(episode, "instruction", f"is {episode.instruction!r}", "words, without underscores")
     columns = provenance_of(extras)
     if set(episode.provenance) != set(columns):
         wrong = sorted(set(episode.provenance) ^ set(columns))
         raise _fault(episode, "provenance", f"lacks or adds {wrong}", f"exactly {list(columns)}")
     types = {"string": str, "int64": int, "float32": float, "bool": bool}
-    if wrong := sorted(k for k, v in episode.provenance.items() if not isinstance(v, types[columns[k]])):
-        expected = ", ".join(f"{columns[key]} in {key}" for key in wrong)
-        raise _fault(episode, "provenance", f"holds something else in {wrong}", expected)
+    mistyped = sorted(key for key, value in episode.provenance.items() if not isinstance(value, types[columns[key]]))
+    if mistyped:
+        expected = ", ".join(f"{columns[key]} in {key}" for key in mistyped)
+        raise _fault(episode, "provenance", f"has another type in {mistyped}", expected)
     if episode.provenance["episode_id"] != episode.episode_id:
         raise _fault(episode, "provenance", f"names episode {episode.provenance['episode_id']!r}", "its own episode_id")
 
@@ -206,18 +212,21 @@ def _check_frames(episode: Episode, steps: int) -> None:
         for index, data in enumerate(frames):
             try:
                 scan = data.find(JPEG_SCAN)
-                found = _look(data[: scan + SCAN_HEADER_BYTES] if scan >= 0 else data)
+                properties = _look(data[: scan + SCAN_HEADER_BYTES] if scan >= 0 else data)
             except UnidentifiedImageError:
                 raise _fault(episode, view, f"frame {index} is not an image", f"{expected}") from None
-            if found != expected:
-                raise _fault(episode, view, f"frame {index} is {found}", f"{expected}")
+            if properties != expected:
+                raise _fault(episode, view, f"frame {index} is {properties}", f"{expected}")
             if not data.endswith(JPEG_END):
                 raise _fault(episode, view, f"frame {index} is cut short", "a whole JPEG file")
 
 
 @lru_cache
 def _look(header: bytes) -> tuple[str | None, str, tuple[int, int]]:
-    """Format, mode and size of an image; frames of the same encoder begin with the same header."""
+    """Read format, mode and size of an image.
+
+    Calls are cached by the header: frames of one encoder begin with equal headers.
+    """
     with Image.open(io.BytesIO(header)) as image:
         return image.format, image.mode, image.size
 
@@ -229,10 +238,12 @@ def _check_geometry(episode: Episode, steps: int, extras: Collection[Extra]) -> 
         for name in MATRICES:
             _check_array(episode, f"{view}_{name}", getattr(geometry, name), getattr(SCHEMA, name))
         lengths = {name: len(files) for name, files in geometry.maps.items()}
-        if lengths != {name: steps for name in MAPS if name in extras}:
+        wanted = {name: steps for name in MAPS if name in extras}
+        if lengths != wanted:
             raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each that is asked for")
     if ("object_poses" in extras) != (episode.object_poses is not None):
-        raise _fault(episode, "object_poses", "are there or are not", "what render.extras asks for")
+        expected = "poses if, and only if, render.extras lists them"
+        raise _fault(episode, "object_poses", "are missing or not requested", expected)
     if episode.object_poses is not None:
         _check_array(episode, "object_poses", episode.object_poses, SCHEMA.object_poses, steps)
     if named(extras) != bool(episode.instances):
@@ -254,5 +265,5 @@ def _fault(episode: Episode, field: str, what: str, expected: str) -> PipelineEr
         f"{field} {what}",
         where=f"episode {episode.episode_id}",
         expected=expected,
-        remedy="mend what makes this episode, or drop it from the plan",
+        remedy="correct the source of this episode, or drop it from the plan",
     )

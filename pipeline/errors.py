@@ -1,19 +1,19 @@
-"""One exception type for everything a user can cause and mend."""
+"""Exception type for every fault that a user can cause and correct."""
 
 from functools import partial
 
 MAKE_AGAIN = "python -m pipeline run CONFIG"
-"""The remedy where something that a run makes is missing or damaged. `dvc repro` would perform the run that params.yaml names."""
+"""Remedy where an output of a run is missing or damaged. `dvc repro` would run the configuration in params.yaml."""
 
 
 class PipelineError(Exception):
-    """Says what is wrong, where, what was expected and what to try.
+    """Error that states the fault, its place, the expected value and a remedy.
 
     Args:
         what: the fault, one sentence without a full stop.
-        where: the file, field or row it was found in.
-        expected: what would have been right (list the values that would have worked).
-        remedy: the command or edit that mends it.
+        where: the file, field or row of the fault.
+        expected: a correct value (list the values that would have worked).
+        remedy: the command or edit that corrects the fault.
     """
 
     def __init__(self, what: str, *, where: object = None, expected: str | None = None, remedy: str | None = None):
@@ -26,13 +26,13 @@ class PipelineError(Exception):
         super().__init__("\n".join(lines))
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Keyword-only arguments need this to survive the trip back from a worker process.
+        # Exceptions with keyword-only arguments cannot be pickled otherwise, on their way back from a worker process.
         where = None if self.where is None else str(self.where)
         return partial(PipelineError, self.what, where=where, expected=self.expected, remedy=self.remedy), ()
 
 
 class RefusedError(Exception):
-    """A perturbation that does not go with its scene.
+    """A perturbation that is rejected in its scene.
 
     Args:
         reason: short and in snake_case, such as ``robot_in_collision``.

@@ -14,16 +14,16 @@ from pipeline.errors import PipelineError
 from pipeline.types import Frozen
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
-"""More than anybody has a use for would fill memory before anything is said."""
+"""A number of files. Its limit is above any use: larger numbers would fill memory before any message appears."""
 
 
 def validating(share: float, demonstrations: int) -> int:
-    """How many of a task's demonstrations go into ``val``: rounded, a half to the even number; never the only one."""
+    """Return the number of a task's demonstrations in ``val``: rounded half to even, and 0 for a single one."""
     return round(share * demonstrations) if demonstrations > 1 else 0
 
 
 def too_few(share: float, where: str) -> PipelineError:
-    """The error that no task, of all or of a suite, has enough demonstrations for a share above 0."""
+    """Return the error that no task, in total or in a suite, has enough demonstrations for a share above 0."""
     least = next(number for number in count(max(2, int(0.5 / share))) if validating(share, number))
     return PipelineError(
         f"no task has enough demonstrations for {share:g} of them to go into the split val",
@@ -34,7 +34,7 @@ def too_few(share: float, where: str) -> PipelineError:
 
 
 def known_to_oft(name: str) -> bool:
-    """Whether OpenVLA-OFT, which goes by the name, reads a set with LIBERO's constants and cameras."""
+    """Return whether OpenVLA-OFT, which decides by the name, reads a set with LIBERO's constants and cameras."""
     return "libero" in name and "aloha" not in name
 
 
@@ -46,10 +46,10 @@ def _of_some(share: float) -> float:
 
 Share = Annotated[float, Field(ge=0.0, le=0.5), AfterValidator(_of_some)]
 LONGEST_NAME = 60
-"""Characters of a name that paths contain. A path may join several names; file systems end a name after 255 bytes."""
+"""Largest length of a name in paths. A path may join several names; file systems limit a name to 255 bytes."""
 
 Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$", max_length=LONGEST_NAME)]
-"""Of a dataset; empty for ``libero_`` and the name of the run, which ``Config`` puts in its place."""
+"""Name of a dataset; ``Config`` replaces an empty name by ``libero_`` and the name of the run."""
 
 
 class RldsConfig(Frozen):
@@ -79,17 +79,20 @@ class LeRobotConfig(Frozen):
     """
 
     name: Name = ""
-    # Finished datasets are identified by their options, in which the field has its first name.
+    # The identity of finished datasets depends on their options, which contain the field under its first name.
     shards: Count | None = Field(default=None, serialization_alias="parts")
     frames: Literal["video", "images"] = "video"
     validation: Share = 0.0
-    # Left out where it says nothing, as ``lerobot_v21``.
+    # Excluded at its default, as ``lerobot_v21``.
     language: bool = Field(default=False, exclude_if=lambda language: not language)
 
     @field_validator("language")
     @classmethod
     def _readable(cls, language: bool) -> bool:
-        if language and Version(installed := version("lerobot")) < Version("0.6"):
+        if not language:
+            return language
+        installed = version("lerobot")
+        if Version(installed) < Version("0.6"):
             raise ValueError(
                 f"lerobot {installed}, which checks the set here, cannot read language columns; expected 0.6 or later, "
                 "which the installation on Python 3.12 or later has"
@@ -118,7 +121,7 @@ class Where(Frozen):
     suite: tuple[str, ...] | None = Field(default=None, min_length=1)
 
     def takes(self, axis: str, component: str, level: str, suite: str) -> bool:
-        """Whether an episode is written, by its columns of the plan."""
+        """Return whether an episode is written, by its columns of the plan."""
         return (
             (self.axis is None or axis in self.axis)
             and (self.component is None or set(component.split("+")) <= set(self.component))
@@ -154,7 +157,7 @@ class ExportConfig(Frozen):
 
     rlds: RldsConfig | None = RldsConfig()
     lerobot: LeRobotConfig | None = LeRobotConfig()
-    # Left out where they say nothing, so that what was finished before they were added stays what it is.
+    # Excluded at their defaults, so that datasets keep the identity that they had before these fields were added.
     lerobot_v21: LeRobotV21Config | None = Field(default=None, exclude_if=lambda options: options is None)
     where: Where | None = Field(default=None, exclude_if=lambda where: where is None)
     failures: bool = Field(default=False, exclude_if=lambda asked: not asked)
@@ -167,41 +170,44 @@ class ExportConfig(Frozen):
 
     @property
     def formats(self) -> dict[str, RldsConfig | LeRobotConfig | LeRobotV21Config]:
-        """Name to options of each format that is asked for."""
+        """Return the options of each requested format, by its name."""
         formats = {"rlds": self.rlds, "lerobot": self.lerobot, "lerobot_v21": self.lerobot_v21}
         return {name: options for name, options in formats.items() if options is not None}
 
     @property
     def name(self) -> str:
-        """What the datasets of a run are called together."""
+        """Return the common name of a run's datasets."""
         return (self.lerobot or next(iter(self.formats.values()))).name
 
     def named(self, name: str) -> ExportConfig:
-        """With a name for each dataset that has none."""
-        unnamed = {one: options for one, options in self.formats.items() if not options.name}
-        return self.model_copy(update={one: o.model_copy(update={"name": name}) for one, o in unnamed.items()})
+        """Return a copy in which each dataset without a name has the given one."""
+        formats = {}
+        for format_name, options in self.formats.items():
+            if not options.name:
+                formats[format_name] = options.model_copy(update={"name": name})
+        return self.model_copy(update=formats)
 
     def of_failures(self) -> ExportConfig:
-        """How failures are written: as the other episodes, under another name, and without a validation split."""
-        formats = {
-            one: options.model_copy(update={"name": f"{options.name}_failures", "validation": 0.0})
-            for one, options in self.formats.items()
-        }
+        """Return the options for failures: under another name, without a validation split, and otherwise unchanged."""
+        formats = {}
+        for format_name, options in self.formats.items():
+            changes = {"name": f"{options.name}_failures", "validation": 0.0}
+            formats[format_name] = options.model_copy(update=changes)
         return self.model_copy(update=formats)
 
     def refuse_too_few(self, demonstrations: Mapping[str, int]) -> None:
-        """Refuse a validation split that nothing could be in.
+        """Reject a validation split that would stay empty.
 
-        RLDS has a set for each suite, and OpenVLA-OFT, when it validates, asks each for its ``val``.
+        RLDS has a set for each suite. OpenVLA-OFT, when it validates, reads the split ``val`` of each set.
 
         Args:
-            demonstrations: suite to the number of those of its task that has most of them.
+            demonstrations: suite to the largest number of demonstrations among its tasks.
 
         Raises:
-            PipelineError: when a share holds none of them out.
+            PipelineError: when a share puts no demonstration into ``val``.
         """
-        asked = self.where.suite if self.where else None
-        written = [number for suite, number in demonstrations.items() if asked is None or suite in asked]
+        suites = self.where.suite if self.where else None
+        written = [number for suite, number in demonstrations.items() if suites is None or suite in suites]
         for name, options in self.formats.items():
             least = min if name == "rlds" else max
             if options.validation and not validating(options.validation, least(written, default=0)):

@@ -1,7 +1,7 @@
-"""Which OpenGL renders: a GPU through EGL, else Mesa in software through EGL, else OSMesa.
+"""Choice of the OpenGL renderer: a GPU through EGL, else Mesa in software through EGL, else OSMesa.
 
-The choice is made when the first renderer of a process is made, and never by an import: physics needs no OpenGL. Worker
-processes inherit it. Two renderers may differ by some grey levels, so the choice is printed and recorded.
+The first renderer of a process triggers the choice, and an import never does: physics needs no OpenGL. Worker processes
+inherit the choice. Two renderers may differ by some grey levels, so the choice is printed and recorded.
 """
 
 import ctypes
@@ -28,18 +28,18 @@ DEVICES, LOADED_GPUS = Path("/dev"), Path("/proc/driver/nvidia/gpus")
 
 
 ASKED = "MUJOCO_GL asks for it"
-"""The reason of a choice that was not ours."""
+"""Reason of a choice that the user made."""
 
 
 @dataclass(frozen=True)
 class GlChoice:
-    """What renders in this process and in those it starts.
+    """Renderer of this process and of its child processes.
 
     Attributes:
         backend: ``egl`` or ``osmesa``.
         device: the renderer and its driver, as OpenGL names them.
-        reason: why this one.
-        device_named: whether ``MUJOCO_EGL_DEVICE_ID`` named the device, so that no other may be used.
+        reason: reason of the choice.
+        device_named: True if ``MUJOCO_EGL_DEVICE_ID`` named the device, so that no other device may be used.
     """
 
     backend: str
@@ -61,13 +61,13 @@ _of_the_run: GlChoice | None = None
 
 @functools.cache
 def choose() -> GlChoice:
-    """Try what is there in short subprocesses (0.7 s each), set the environment, return the choice for printing.
+    """Try the renderers in short subprocesses (0.7 s each), set the environment, return the choice for printing.
 
-    ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set. A worker of this machine takes over
-    what the run's own process chose (``WorkerSetup``).
+    ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set. A worker of this machine uses the
+    choice of the run's own process (``WorkerSetup``).
 
     Raises:
-        PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does; or as
+        PipelineError: when ``MUJOCO_GL`` names a back end that does not render here, or when no back end renders; or as
             ``check_device``.
     """
     if _of_the_run is not None:
@@ -118,8 +118,10 @@ def check_device() -> None:
 
 @functools.cache
 def gpus() -> tuple[str, ...]:
-    """EGL's indices of all GPUs like the chosen one, for worker processes to share; none where there is no choice, or
-    where ``CUDA_VISIBLE_DEVICES`` names them otherwise than by numbers.
+    """Return EGL's indices of all GPUs like the chosen one, for worker processes to share.
+
+    The tuple is empty where the device is fixed or no GPU renders, and where ``CUDA_VISIBLE_DEVICES`` does not list
+    numbers.
     """
     choice = choose()
     if choice.software or choice.device_named or choice.backend != "egl":
@@ -127,52 +129,52 @@ def gpus() -> tuple[str, ...]:
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     if visible and not visible[0].isdigit():
         return ()
-    found = []
+    indices = []
     for index in visible.split(",") if visible else map(str, count()):
         try:
             device = _probe("egl", index)
         except _NoDeviceError:
-            # There is none of that number: EGL counts without gaps.
+            # No GPU has that number: EGL counts without gaps.
             break
         if device == choice.device:
-            found.append(index)
-    return tuple(found)
+            indices.append(index)
+    return tuple(indices)
 
 
 class WorkerSetup:
-    """What renders here, for worker processes of this machine: they need not try it again. Raises as ``choose``."""
+    """Choice of this process for worker processes of this machine, which skip the trials. Raises as ``choose``."""
 
     def __init__(self) -> None:
         self._choice, self._gpus = choose(), gpus()
         self._environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
 
     def __call__(self, worker: int) -> None:
-        """Have this process, the worker of that number, render with it, on one of several GPUs in turn."""
+        """Make this process, the worker of that number, render with the choice, on one of several GPUs in turn."""
         global _of_the_run
         _of_the_run = self._choice
         os.environ.update(self._environment)
         if self._gpus:
-            # MuJoCo looks when it opens its first context.
+            # MuJoCo reads the variable when it opens its first context.
             os.environ["MUJOCO_EGL_DEVICE_ID"] = self._gpus[worker % len(self._gpus)]
 
 
 def prepare() -> None:
-    """``choose``, and have MuJoCo render with the choice, also where it was imported before without OpenGL."""
+    """Make MuJoCo render with the result of ``choose``, also if MuJoCo was imported before without OpenGL."""
     backend = choose().backend
-    # mujoco.Renderer looks its context class up here; MuJoCo itself fills it in by MUJOCO_GL, but only when imported.
+    # mujoco.Renderer reads its context class from this module. MuJoCo itself sets it by MUJOCO_GL, but only at import.
     context: Any = import_module("mujoco.gl_context")
     context.GLContext = import_module(f"mujoco.{backend}").GLContext
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo without OpenGL: left to itself, it loads what ``MUJOCO_GL`` names, and fails where that is not."""
+    """Import MuJoCo without OpenGL; a plain import loads the library of ``MUJOCO_GL`` and fails if it is missing."""
     with left_out():
         import mujoco  # noqa: F401
 
 
 @contextmanager
 def left_out() -> Iterator[None]:
-    """For a moment, have MuJoCo and robosuite load no OpenGL when they are imported, whatever ``MUJOCO_GL`` names.
+    """Keep MuJoCo and robosuite from loading OpenGL when they are imported in the block, whatever ``MUJOCO_GL`` names.
 
     Raises:
         PipelineError: as ``check_device``.
@@ -189,18 +191,19 @@ def left_out() -> Iterator[None]:
 
 
 class _NoDeviceError(Exception):
-    """A back end that rendered nothing, and why."""
+    """A back end that rendered nothing, with the reason."""
 
 
 def _best_device(backend: str) -> tuple[str, str | None]:
-    """The first GPU, or else the first renderer, as its name and the ``MUJOCO_EGL_DEVICE_ID`` it needs."""
+    """Return the first GPU, or else the first renderer: its name and the ``MUJOCO_EGL_DEVICE_ID`` that it needs."""
     index = os.environ.get("MUJOCO_EGL_DEVICE_ID")
-    # Render on the GPU that the job was given, where EGL and CUDA count alike: robosuite goes by the same rule, and
-    # refuses a device that is not in this list. Without an index mujoco takes the first device that answers.
+    # Render on the GPU that the job was given, if EGL and CUDA count alike: robosuite follows the same rule, and
+    # rejects a device that is not in this list. Without an index MuJoCo uses the first device that answers.
     first_visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0]
     if backend == "egl" and index is None and first_visible.isdigit():
         with suppress(_NoDeviceError):
-            if not _is_software(device := _probe(backend, first_visible)):
+            device = _probe(backend, first_visible)
+            if not _is_software(device):
                 return device, first_visible
     return _probe(backend, index), index
 
@@ -221,17 +224,16 @@ def _probe(backend: str, index: str | None) -> str:
 
 
 def idle_gpu() -> tuple[str, str] | None:
-    """Why no GPU of this machine renders, and what to try; nothing where there is none.
+    """Return why no GPU of this machine renders, and the remedy; ``None`` if the machine has no GPU.
 
-    EGL needs a device node that this user may open, and for NVIDIA the driver's library and a file that names it where
-    libglvnd looks (its src/EGL/icd_enumeration.md).
+    EGL needs a device node that this user may open. For NVIDIA it also needs the driver's library, and a file that
+    names the library in a folder that libglvnd reads (its src/EGL/icd_enumeration.md).
     """
     nvidia = sorted(DEVICES.glob("nvidia[0-9]*"))
-    closed = [
-        node
-        for node in (*nvidia, *sorted(DEVICES.glob("dri/renderD*")))
-        if not os.access(node, os.R_OK | os.W_OK, effective_ids=True)
-    ]
+    closed = []
+    for node in (*nvidia, *sorted(DEVICES.glob("dri/renderD*"))):
+        if not os.access(node, os.R_OK | os.W_OK, effective_ids=True):
+            closed.append(node)
     if not nvidia and LOADED_GPUS.is_dir():
         return (
             f"NVIDIA's driver is loaded, but there is no {DEVICES}/nvidia0",
@@ -245,10 +247,10 @@ def idle_gpu() -> tuple[str, str] | None:
             "have graphics among NVIDIA_DRIVER_CAPABILITIES",
         )
     if nvidia and not any(NVIDIA_EGL in file.read_text(errors="replace") for file in _vendor_files()):
-        named = json.dumps({"file_format_version": "1.0.0", "ICD": {"library_path": NVIDIA_EGL}})
+        vendor_file = json.dumps({"file_format_version": "1.0.0", "ICD": {"library_path": NVIDIA_EGL}})
         return (
             f"no EGL vendor file names {NVIDIA_EGL}",
-            f"echo '{named}' | sudo tee /usr/share/glvnd/egl_vendor.d/10_nvidia.json; "
+            f"echo '{vendor_file}' | sudo tee /usr/share/glvnd/egl_vendor.d/10_nvidia.json; "
             "unset __EGL_VENDOR_LIBRARY_FILENAMES __EGL_VENDOR_LIBRARY_DIRS",
         )
     if closed:
@@ -262,7 +264,7 @@ def idle_gpu() -> tuple[str, str] | None:
 
 
 def _loads(library: str) -> bool:
-    """Whether the loader finds a library, also by ``LD_LIBRARY_PATH``, as containers are given the driver."""
+    """Return whether the loader finds a library, also by ``LD_LIBRARY_PATH``, which containers use for the driver."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -271,9 +273,10 @@ def _loads(library: str) -> bool:
 
 
 def _vendor_files() -> list[Path]:
-    """Files that tell libglvnd which drivers there are."""
-    if named := os.environ.get("__EGL_VENDOR_LIBRARY_FILENAMES"):
-        files = [Path(file) for file in named.split(":")]
+    """List the files that tell libglvnd about the installed drivers."""
+    filenames = os.environ.get("__EGL_VENDOR_LIBRARY_FILENAMES")
+    if filenames:
+        files = [Path(file) for file in filenames.split(":")]
     else:
         folders = os.environ.get("__EGL_VENDOR_LIBRARY_DIRS", VENDOR_FOLDERS).split(":")
         files = [file for folder in folders for file in Path(folder).glob("*.json")]
@@ -287,13 +290,14 @@ def _is_software(device: str) -> bool:
 def _reason(backend: str, device: str, faults: dict[str, str]) -> str:
     if not _is_software(device):
         return "a GPU"
-    if idle := idle_gpu():
+    idle = idle_gpu()
+    if idle:
         return f"software, many times slower than the GPU that is there: {idle[0]}; {idle[1]}"
     return f"software, as EGL fails: {faults['egl']}" if backend == "osmesa" else "software, as no GPU answers"
 
 
 def _render_once() -> str:
-    """The renderer of this process; a context alone proves little, so it renders a frame."""
+    """Render a frame, because a context alone proves little, and return the renderer of this process."""
     import mujoco
     from OpenGL import GL
 

@@ -1,4 +1,4 @@
-"""Values collected by their keys."""
+"""Grouping of values by their keys."""
 
 from collections.abc import Iterable
 from typing import TypeVar
@@ -8,7 +8,7 @@ Value = TypeVar("Value")
 
 
 def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
-    """Key to its values; keys in the order in which they first come, values in theirs."""
+    """Return each key's values; keys in the order of their first occurrence, values in the order of the pairs."""
     groups: dict[Key, list[Value]] = {}
     for key, value in pairs:
         groups.setdefault(key, []).append(value)

@@ -1,7 +1,7 @@
-"""Loops over pixels, faces and characters, compiled by Numba when they are first called.
+"""Loops over pixels, faces and characters, compiled by Numba at their first call.
 
-Numba keeps what it compiled beside the source, for all processes that come later; ``setup.sh`` has it compile all loops
-once (``pipeline/validation/loops.py``).
+Numba stores compiled loops next to the source, for all later processes. ``setup.sh`` compiles all loops once
+(``pipeline/validation/loops.py``).
 """
 
 from collections.abc import Callable, Iterator
@@ -12,16 +12,16 @@ from typing import Any, ParamSpec, TypeVar
 from pipeline.errors import PipelineError
 
 DISPATCHERS: dict[str, Callable[[], Any]] = {}
-"""Name of each compiled function to what gives Numba's dispatcher for it."""
+"""Name of each compiled function to a function that returns its Numba dispatcher."""
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """``numba.njit(cache=True)``, but Numba is not imported before it is needed.
+    """Apply ``numba.njit(cache=True)``, but import Numba only at the first call.
 
-    Its import takes over a second, and every process of a run imports the axes, most of them without such a loop.
+    The import takes over a second. Every process of a run imports the axes, but most processes call no such loop.
     """
 
     @cache
@@ -43,7 +43,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
 @contextmanager
 def keeping_compiled() -> Iterator[None]:
-    """Name the variable to set where Numba finds no folder for what it compiles.
+    """Name the variable to set if Numba finds no folder for compiled loops.
 
     Numba tries the source's folder and then ``~/.cache/numba``, for robosuite's loops as soon as they are imported.
 

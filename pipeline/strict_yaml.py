@@ -1,4 +1,4 @@
-"""YAML that a person wrote: plain values, and each key of a mapping once."""
+"""Loaders for YAML that a person wrote: plain values, and each key of a mapping once."""
 
 import re
 from typing import Any
@@ -7,27 +7,30 @@ import yaml
 
 
 class _EachKeyOnce(yaml.constructor.SafeConstructor):
-    """Refuses a mapping with a repeated key, of which YAML's own constructor takes the last value."""
+    """Constructor that rejects a mapping with a repeated key; YAML's own constructor takes the last value."""
 
     def construct_document(self, node: yaml.Node) -> Any:
-        # Before anything is constructed: a merge key (<<) then copies pairs from one mapping into another.
-        nodes, known = [node], {node}
-        for one in nodes:
-            pairs = one.value if isinstance(one, yaml.MappingNode) else []
+        # Keys are checked before construction, in which a merge key (<<) copies pairs from one mapping into another.
+        nodes, visited = [node], {node}
+        for current in nodes:
+            pairs = current.value if isinstance(current, yaml.MappingNode) else []
             names = [key.value for key, _ in pairs]
             for place, (key, _) in enumerate(pairs):
                 if key.value in names[:place]:
                     raise yaml.constructor.ConstructorError(
                         None, None, f"the key {key.value!r} is given twice", key.start_mark
                     )
-            parts = one.value if isinstance(one, yaml.SequenceNode) else [part for pair in pairs for part in pair]
-            nodes += [part for part in dict.fromkeys(parts) if part not in known]
-            known.update(parts)
+            if isinstance(current, yaml.SequenceNode):
+                parts = current.value
+            else:
+                parts = [part for pair in pairs for part in pair]
+            nodes += [part for part in dict.fromkeys(parts) if part not in visited]
+            visited.update(parts)
         return super().construct_document(node)
 
 
 class StrictLoader(_EachKeyOnce, yaml.SafeLoader):
-    """What reads a person's YAML: plain values, and each key of a mapping once.
+    """Loader of a person's YAML: plain values, and each key of a mapping once.
 
     Unlike YAML 1.1, ``yes``, ``off``, ``0123`` (octal 83) and ``1:30`` (90 in base 60) are text.
     """
@@ -49,4 +52,4 @@ for _tag, _pattern, _first in (
 
 
 class FastStrictLoader(_EachKeyOnce, yaml.CSafeLoader):
-    """Each key once too, in C, for long files; what is nested thousands deep ends the process."""
+    """Loader in C for long files, each key once too; thousands of nested levels end the process."""

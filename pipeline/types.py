@@ -1,4 +1,4 @@
-"""The nouns of the pipeline, in the order in which data meets them."""
+"""Data types of the pipeline, in the order of the data flow."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 """(H, W, 3) RGB."""
 RenderedExtra = Literal["depth", "segmentation", "object_poses"]
-"""What the render stage makes beside the frames when it is asked to."""
+"""Optional output of the render stage in addition to frames."""
 Extra = Literal[RenderedExtra, "outcome"]
-"""What a dataset has beside the frames; ``outcome``, that of failures says of each episode why it is one."""
+"""Optional content of a dataset in addition to frames; ``outcome`` states why each episode of a failures set failed."""
 
 
 class Frozen(BaseModel):
-    """A record that cannot change and refuses fields it does not know, and numbers that are not finite."""
+    """An immutable record that rejects unknown fields and numbers that are not finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -35,7 +35,7 @@ Place = Annotated[Path, AfterValidator(Path.expanduser)]
 
 
 class State(NamedTuple):
-    """A flattened MuJoCo state (S,), taken apart.
+    """The parts of a flattened MuJoCo state (S,).
 
     Attributes:
         time: in s.
@@ -49,7 +49,7 @@ class State(NamedTuple):
 
     @classmethod
     def of(cls, flat: Floats, nq: int) -> State:
-        """The parts of a state (S,); what is written into them is written into it."""
+        """Return the parts of a state (S,) as views: writing into ``qpos`` or ``qvel`` changes the state."""
         return cls(flat[0], flat[1 : 1 + nq], flat[1 + nq :])
 
     @property
@@ -57,7 +57,7 @@ class State(NamedTuple):
         return np.concatenate([[self.time], self.qpos, self.qvel])
 
     def put_into(self, data: mujoco.MjData) -> None:
-        """Nothing that follows from it is computed."""
+        """Copy the state into MuJoCo's data, without computing the quantities that follow from it."""
         data.time, data.qpos[:], data.qvel[:] = self
 
 
@@ -68,8 +68,8 @@ class Task:
     Attributes:
         suite: ``libero_spatial``, ``libero_object``, ``libero_goal`` or ``libero_10``.
         name: LIBERO's task name, the stem of its BDDL file.
-        instruction: the wording of LIBERO's task list, as policies are prompted with it.
-        bddl_file: where the scene and the goal are defined.
+        instruction: the wording of LIBERO's task list, with which policies are prompted.
+        bddl_file: the file that defines the scene and the goal.
     """
 
     suite: str
@@ -87,16 +87,16 @@ class Demo:
 
     Attributes:
         key: its name in its source, such as ``demo_0``.
-        source: where it came from, for provenance (never parsed).
-        origin: who made it, ``human``, or ``expanded`` when it was made from a human one.
+        source: its source, for provenance (never parsed).
+        origin: ``human``, or ``expanded`` if it was generated from a human demonstration.
         sha256: hash of the recorded content (actions, states, model), 64 hex digits.
         actions: (T, 7) OSC_POSE deltas in [-1, 1] and gripper (-1 open, +1 close), 20 Hz.
         init_state: (S,) flattened MuJoCo state before the first action: time, qpos, qvel.
-        states: (T, S) the same before each action, or None when the source recorded only the first.
-        model_xml: MJCF of the recorded scene with asset paths of this machine, or None when the source did
-            not record it (then fixtures are placed by LIBERO's own reset under a fixed seed).
-        perturbations: JSON of what an expansion changed; an empty list if nothing.
-        expanded_from_sha256: ``sha256`` of the human demonstration that it was made from; None for a human one.
+        states: (T, S) flattened MuJoCo states before each action, or ``None`` when the source recorded only the first.
+        model_xml: MJCF of the recorded scene with asset paths of this machine, or ``None`` when the source did not
+            record it. LIBERO's own reset under a fixed seed then places the fixtures.
+        perturbations: JSON list of the changes of an expansion; an empty list without changes.
+        expanded_from_sha256: ``sha256`` of the human demonstration behind an expansion; ``None`` for a human one.
     """
 
     task: Task
@@ -117,13 +117,13 @@ class Demo:
 
 
 class Push(NamedTuple):
-    """An external force in the course of an episode.
+    """An external force during an episode.
 
     Attributes:
-        body: of MuJoCo's model, on whose centre of mass it acts (``mj_data.xfrc_applied``).
+        body: body of MuJoCo's model; the force acts on its centre of mass (``mj_data.xfrc_applied``).
         wrench: (6,) force in N and torque in N m along the world's axes.
-        first_step: executed actions before it, since the first look.
-        steps: control steps that it lasts.
+        first_step: number of executed actions between the first observation and the push.
+        steps: duration in control steps.
     """
 
     body: str
@@ -134,18 +134,19 @@ class Push(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Where a replay starts.
+    """Start of a replay.
 
     Attributes:
         model_xml: MJCF with asset paths of this machine.
         state: (S,) flattened MuJoCo state: time, qpos, qvel.
-        resolved: axis to what its perturbation came to in this scene, JSON-serialisable, such as where objects ended.
-        gripper: where the gripper's command stands: -1 open, 1 closed, 0 as after LIBERO's reset. The next action is
-            added to it, so it takes four control steps from 0 to -1.
-        posture_rad: (7,) joint angles of the reset that came before the state was put in. To these the controller's
-            null space pulls the arm, and it keeps their orientation of the hand until an action turns that. None where
-            it holds the arm as the state has it.
-        push: what pushes the robot in the course of the episode, whatever is done meanwhile.
+        resolved: axis to the JSON-serialisable result of its perturbation in this scene, such as final object
+            positions.
+        gripper: current gripper command: -1 open, 1 closed, 0 as after LIBERO's reset. The next action is added to it,
+            so the change from 0 to -1 takes four control steps.
+        posture_rad: (7,) joint angles of the reset that came before the state was set. The controller's null space
+            pulls the arm to these angles. The controller keeps their orientation of the hand until an action turns it.
+            ``None`` if the controller holds the arm as in the state.
+        push: force on the robot during the episode, independent of the actions.
     """
 
     model_xml: str
@@ -157,14 +158,15 @@ class Scene:
 
 
 RollOut = Callable[[Scene, Demo], Floats]
-"""(K+1, S) states that a demonstration's actions lead through from a scene."""
+"""Function that returns the (K+1, S) states through which a demonstration's actions lead from a scene."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether something planned is kept.
+    """Decision to keep or drop a planned item.
 
     Attributes:
+        kept: True if the item is kept.
         reason: ``kept``, or a short reason in snake_case, such as ``goal_not_reached``.
     """
 
@@ -174,9 +176,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a trajectory was moved (``physics/quality.py``): columns of the manifest, with what they mean.
+    """Quality measures of a trajectory's motion (``physics/quality.py``): columns of the manifest, with their meanings.
 
-    Another object is one that the goal does not name, and that stands on or in nothing that the goal moves.
+    In these meanings, the goal does not name "another object". Such an object also does not stand on or in anything
+    that the goal moves.
     """
 
     non_target_moved_m: Annotated[float, "largest displacement of another object at any step, from the first look"]
@@ -191,17 +194,18 @@ class Quality:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What physics did: no pixels.
+    """Result of physics, without pixels.
 
     Attributes:
         trajectory_id: hash of everything that determines it.
-        mode: how its actions came about, ``open_loop`` or ``tracked``.
-        scene: where it started, before the arm and the objects settled; asset paths of this machine.
-        states: (K+1, S) flattened states: before each executed action, and after the last. The first is the first look.
+        mode: method that produced its actions, ``open_loop`` or ``tracked``.
+        scene: its start, before the arm and the objects settled; asset paths of this machine.
+        states: (K+1, S) flattened states: before each executed action, and after the last. The first state is that of
+            the first observation.
         actions: (K, 7) executed actions.
-        site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
-        verdict: the judge's word after the last action.
-        quality: how well it was moved; None where nothing was executed, or nobody measured.
+        site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO uses a site to show a lit burner.
+        verdict: the judge's decision after the last action.
+        quality: quality measures; ``None`` if no action was executed or nothing was measured.
     """
 
     trajectory_id: str
@@ -219,18 +223,18 @@ class Trajectory:
 
     @property
     def resolved(self) -> str:
-        """JSON of what physics perturbations came to, by axis; or under ``fault`` why it could not be simulated."""
+        """Return JSON of the results of physics perturbations by axis, or of the simulation error under ``fault``."""
         return json.dumps(self.scene.resolved, sort_keys=True)
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where a view is seen from, and what it sees beside colours; conventions are those of ``schemas/episode.json``.
+    """Camera matrices of a view and its maps besides colours; ``schemas/episode.json`` defines the conventions.
 
     Attributes:
         intrinsics: (3, 3) float32, camera to pixels of the stored frame.
-        extrinsics: (4, 4) float32, camera to the frame that the view is seen from: the world, or the end effector.
-        maps: ``depth`` and ``segmentation``, where they were asked for, to T PNG files, turned like the frames.
+        extrinsics: (4, 4) float32, camera to the reference frame of the view: the world, or the end effector.
+        maps: ``depth`` and ``segmentation``, where requested, to T PNG files, rotated like the frames.
     """
 
     intrinsics: NDArray[np.float32]
@@ -240,17 +244,17 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Everything that a policy may see of one trajectory.
+    """Everything that a policy may observe of one trajectory.
 
     Attributes:
-        replay_mode: how the trajectory's actions came about.
+        replay_mode: method that produced the trajectory's actions.
         state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
         streams: stream id to K encoded frames.
         rejected: stream id to the reason why it was not rendered.
-        geometry: id of a stream's geometry to what it is.
-        object_poses: (K, 24, 7) float32, None where they were not asked for.
-        instances: names of the things that segmentation and poses number; none without those.
-        quality: the trajectory's.
+        geometry: id of a stream's geometry to the geometry.
+        object_poses: (K, 24, 7) float32, ``None`` if not requested.
+        instances: names of the objects that segmentation and poses number; empty without these extras.
+        quality: quality measures of the trajectory.
     """
 
     replay_mode: str
@@ -266,7 +270,7 @@ class Rendered:
 
 
 class Subtask(NamedTuple):
-    """What is being done, in plain words, from the moment before the action ``step`` on."""
+    """Description of the current subtask in plain words, valid from the moment before the action ``step``."""
 
     step: int
     text: str
@@ -274,18 +278,18 @@ class Subtask(NamedTuple):
 
 @dataclass(frozen=True)
 class Episode:
-    """What a policy sees, ready for the writers; names, units and signs are those of ``schemas/episode.json``.
+    """Observations of a policy, ready for the writers; names, units and signs are those of ``schemas/episode.json``.
 
     Attributes:
-        episode_id: identity by content, joins RLDS, LeRobot and manifest.
+        episode_id: identity by content; it joins RLDS, LeRobot and manifest.
         frames: view name (``image``, ``wrist_image``) to T JPEG files, already rotated.
         state, joint_state, action: (T, 8), (T, 7) and (T, 7) float32.
         instruction: the text the policy is prompted with.
         provenance: the columns named in ``schemas/episode.json``.
-        geometry: view name to where it is seen from.
+        geometry: view name to its camera matrices and maps.
         object_poses, instances: as in ``Rendered``.
-        rewrites: other wordings of its task, for training; none where they were not asked for.
-        subtasks: what is done one after the other; none where they were not asked for.
+        rewrites: other wordings of its task, for training; empty if not requested.
+        subtasks: its subtasks in their order; empty if not requested.
     """
 
     episode_id: str

@@ -1,7 +1,7 @@
-"""What an output format is: one object that writes a dataset, reads it back, and says what belongs to it.
+"""Interface of an output format: an object that writes a dataset, reads it back, and describes its contents.
 
-A new format is a subclass of ``Format`` in a file of its own and a line in ``registry.py``. It is imported wherever
-formats are listed, so heavy libraries are imported in the methods that need them.
+A new format is a subclass of ``Format`` in a file of its own and a line in ``registry.py``. Every listing of formats
+imports it, so methods import the heavy libraries that they need.
 """
 
 import json
@@ -33,8 +33,8 @@ class Export:
 
     Attributes:
         identity: digest of everything that the dataset's bytes depend on.
-        asked: of that, what was asked for: the episodes and the options.
-        made_with: and the rest, in words.
+        asked: digest of the requested part of it: the episodes and the options.
+        made_with: the other part of it, in words.
         files: all files below the format's folder, each with its SHA-256.
         places: episode id to the format's columns of the manifest.
     """
@@ -50,19 +50,19 @@ class Format(ABC, Generic[Options]):
     """A format's dataset of one run.
 
     Args:
-        extras: what the episodes have beside the frames.
+        extras: content of the episodes in addition to the frames.
     """
 
     name: ClassVar[Step]
-    """In the configuration's section ``export``, of the folder and the record in ``data/<run>``, on the command line,
-    and in ``pipeline/identity.py``."""
+    """Name in the configuration's section ``export``, on the command line and in ``pipeline/identity.py``, and of the
+    folder and the record in ``data/<run>``."""
     title: ClassVar[str]
-    """For people, and the hub's tag."""
+    """Name for people, and the hub's tag."""
     columns: ClassVar[tuple[pa.Field, ...]]
-    """Of the manifest: where an episode lies; null when it was dropped."""
+    """Columns of the manifest with the place of an episode; null when it was dropped."""
     keys: Mapping[str, str]
-    """Each view, ``state``, ``joint_state`` and ``action`` to its name in this format; each view's matrices and maps,
-    such as ``image_depth``; and ``provenance`` to where that of an episode lies, with its matrices and instances."""
+    """Names in this format of each view, of ``state``, ``joint_state`` and ``action``, and of each view's matrices and
+    maps, such as ``image_depth``. ``provenance`` is the place of an episode's provenance, matrices and instances."""
     clients: tuple[str, ...]
     """The clients of ``finetune.yaml`` that train on this format."""
     gripper: GripperSpec = SCHEMA.action.gripper
@@ -75,17 +75,17 @@ class Format(ABC, Generic[Options]):
 
     @property
     def folder(self) -> Path:
-        """Holds the format's datasets and nothing else."""
+        """Return the folder of the format's datasets; it contains nothing else."""
         return self.data / self.name
 
     @property
     def root(self) -> Path:
-        """What a client opens."""
+        """Return the folder that a client opens."""
         return self.folder
 
     @property
     def language(self) -> bool:
-        """Whether it takes an episode's rewrites and subtasks."""
+        """Return whether the format stores an episode's rewrites and subtasks."""
         return False
 
     @property
@@ -94,20 +94,21 @@ class Format(ABC, Generic[Options]):
 
     @property
     def stage_record(self) -> Path:
-        """The record that DVC knows the output of the format's stage by."""
-        data = self.data.parent if "outcome" in self.extras else self.data  # Failures are written by the same stage.
+        """Return the record that is an output of the format's stage in DVC."""
+        # One stage writes the kept episodes and the failures.
+        data = self.data.parent if "outcome" in self.extras else self.data
         return data / f"{self.name}.json"
 
     @property
     def work(self) -> Path:
-        """Holds what is being made; on the file system of ``folder``, so that a finished dataset is only renamed."""
+        """Return the folder of unfinished files, on the file system of ``folder``, so that finishing only renames."""
         return self.data / ".work" / self.name
 
     def record(self) -> Export:
-        """The record of the finished dataset.
+        """Read the record of the finished dataset.
 
         Raises:
-            PipelineError: when there is none.
+            PipelineError: when the record is missing or unreadable.
         """
         try:
             record = Export(**json.loads(self.record_file.read_text()))
@@ -116,26 +117,29 @@ class Format(ABC, Generic[Options]):
             raise PipelineError(f"no finished dataset ({error})", where=self.record_file, remedy=MAKE_AGAIN) from error
 
     def written(self) -> list[Written]:
-        """The files of the finished dataset.
+        """List the files of the finished dataset.
 
         Raises:
-            PipelineError: when there is none.
+            PipelineError: as ``record``.
         """
         return [Written(self.name, self.folder / name, sha256) for name, sha256 in self.record().files.items()]
 
-    # Writing: pieces in parallel, each whole or not there, then what joins them.
+    # Writing: pieces in parallel, each complete or absent, then the files that join them.
 
     @abstractmethod
     def pieces(self, episodes: Episodes) -> list[Piece]:
-        """What each worker writes. Pieces below ``dataset/`` already lie where the finished dataset has them."""
+        """Divide the episodes into the pieces that workers write.
+
+        Pieces below ``dataset/`` are already in their place in the finished dataset.
+        """
 
     def sets(self, pieces: Sequence[Piece]) -> set[str]:
-        """Names of the datasets that come of these pieces, each a folder of ``folder``."""
+        """Return the names of the datasets that these pieces form, each a folder below ``folder``."""
         return {Path(piece.path).parts[1] for piece in pieces}
 
     @abstractmethod
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
-        """Write a file or a folder, in a worker; one episode at a time is in memory.
+        """Write a piece, a file or a folder, in a worker, with one episode at a time in memory.
 
         Raises:
             PipelineError: when an episode breaks the schema.
@@ -153,7 +157,7 @@ class Format(ABC, Generic[Options]):
 
     @abstractmethod
     def open(self) -> None:
-        """Read what the dataset says of itself, as far as its episodes are found by that.
+        """Read the metadata by which the dataset's episodes are found.
 
         Raises:
             PipelineError: when it cannot be read.
@@ -161,8 +165,9 @@ class Format(ABC, Generic[Options]):
 
     @abstractmethod
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
-        """List what is off with the dataset as a whole, each with the check's name: ``format``, ``ids``, ``splits`` or
-        ``readable``.
+        """List the faults of the dataset as a whole.
+
+        Each comes with the name of its check: ``format``, ``ids``, ``splits`` or ``readable``.
 
         Args:
             kept: episode id to its row of the manifest.
@@ -174,7 +179,7 @@ class Format(ABC, Generic[Options]):
 
     @abstractmethod
     def read(self, row: Row, cache: Path) -> Copy | None:
-        """An episode, wherever it lies; None when the dataset does not have it.
+        """Read an episode, wherever the dataset has it; ``None`` when the dataset does not have it.
 
         Raises:
             PipelineError: when it cannot be read.
@@ -183,26 +188,26 @@ class Format(ABC, Generic[Options]):
     # Publishing.
 
     def repository_path(self, file: str) -> str:
-        """Path in a repository of a file of ``record().files``."""
+        """Return the path in a repository of a file of ``record().files``."""
         return f"{self.name}/{file}"
 
     def repository_folders(self) -> set[str]:
-        """The top folders of a repository that are the dataset's alone, whatever options it was written with."""
+        """Return a repository's top folders that only this dataset uses, whatever options it was written with."""
         return {self.name}
 
     def tag(self) -> str | None:
-        """What the commit of an upload is tagged, where clients want that."""
+        """Return the tag for the commit of an upload, or ``None`` if no client needs a tag."""
         return None
 
     def viewer(self) -> list[dict[str, str]]:
-        """What the hub's viewer shows beside the manifest."""
+        """Return the tables that the hub's viewer shows in addition to the manifest."""
         return []
 
     @abstractmethod
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
-        """The card's section on loading the dataset, in Markdown.
+        """Return the card's section on loading the dataset, in Markdown.
 
         Args:
-            name: of the run's datasets.
+            name: name of the run's datasets.
             kept: the manifest's rows of its episodes.
         """

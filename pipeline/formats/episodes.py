@@ -1,4 +1,4 @@
-"""The episodes of a dataset: which, in which order, in which splits and slices."""
+"""Selection of a dataset's episodes, their order, and their division into splits and slices."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,13 +17,14 @@ Load = Callable[[str], Episode]
 
 @dataclass(frozen=True)
 class Piece:
-    """Some episodes of a dataset, in a row, which one worker writes.
+    """Consecutive episodes of a dataset, which one worker writes.
 
     Attributes:
-        path: of its file or folder, below the work folder.
-        number: how many pieces come before.
-        first_episode, first_step: how many episodes and steps of the dataset come before.
-        tasks: each of its instructions to the number of it among the dataset's.
+        path: path of its file or folder, below the work folder.
+        number: number of preceding pieces.
+        first_episode, first_step: number of preceding episodes and steps of the dataset.
+        steps: number of its own steps.
+        tasks: each of its instructions to the instruction's number in the dataset.
     """
 
     path: str
@@ -37,12 +38,12 @@ class Piece:
 
 
 class Known(NamedTuple):
-    """What is known of an episode before it is loaded.
+    """Facts about an episode that are available before it is loaded.
 
     Attributes:
-        content: changes with anything that ``load`` would return.
+        content: fingerprint that changes with anything that ``load`` would return.
         demo: its demonstration, ``<suite>/<task>/<key>``.
-        origin: the same for all demonstrations that were made from one human demonstration.
+        origin: identifier that all demonstrations generated from one human demonstration share.
         instruction: the text that the policy is prompted with.
     """
 
@@ -56,11 +57,11 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True)
 class Episodes:
-    """What a dataset is made of.
+    """Content of a dataset.
 
     Attributes:
-        known: episode id to what is known of it, in the order in which they are written: shuffled, because readers walk
-            a dataset in order.
+        known: episode id to the facts about the episode, in the order of writing. The order is shuffled, because
+            readers read a dataset in order.
     """
 
     known: Mapping[str, Known]
@@ -71,17 +72,17 @@ class Episodes:
         return list(self.known)
 
     def by_split(self, validation: float) -> dict[str, list[str]]:
-        """``train``, and ``val`` where a share is for validation, to their episodes in the order of ``ids``.
+        """Divide the episodes into ``train`` and, with a validation share above 0, ``val``, in the order of ``ids``.
 
-        A demonstration goes there with all of its episodes, so that no perturbed episode has its clean twin, or the
-        same actions, on the other side. So do all demonstrations that were made from one: their actions may be equal.
-        Of each task at least one origin stays to train on.
+        All episodes of a demonstration are in one split: no perturbed episode has its clean twin, or equal actions, in
+        the other split. All demonstrations generated from one are in one split too, because their actions
+        may be equal. At least one origin of each task stays in ``train``.
 
         Args:
             validation: share of each task's origins, by number, rounded; chosen by a hash of a demonstration's name.
 
         Raises:
-            PipelineError: when there is nothing to write, or the demonstrations are too few for a validation split.
+            PipelineError: when there are no episodes, or the demonstrations are too few for a validation split.
         """
         if not self.known:
             raise PipelineError(
@@ -94,54 +95,62 @@ class Episodes:
         chosen = self._origins_for(validation)
         if not chosen:
             raise too_few(validation, "export.<format>.validation")
-        splits = grouped(("val" if _origin(known) in chosen else "train", one) for one, known in self.known.items())
-        return {split: splits[split] for split in ("train", "val")}
+        splits: dict[str, list[str]] = {"train": [], "val": []}
+        for episode_id, facts in self.known.items():
+            split_name = "val" if _origin(facts) in chosen else "train"
+            splits[split_name].append(episode_id)
+        return splits
 
     def _origins_for(self, validation: float) -> set[tuple[str, str]]:
         """Choose the given share of each task's origins."""
-        places = grouped((_origin(known), digest("validation", known.demo)) for known in self.known.values())
-        by_task = grouped((task, (min(digests), (task, origin))) for (task, origin), digests in places.items())
+        digests_of = grouped((_origin(facts), digest("validation", facts.demo)) for facts in self.known.values())
+        by_task = grouped((task, (min(digests), (task, origin))) for (task, origin), digests in digests_of.items())
         chosen: set[tuple[str, str]] = set()
         for origins in by_task.values():
-            chosen |= {origin for _, origin in sorted(origins)[: validating(validation, len(origins))]}
+            first_origins = sorted(origins)[: validating(validation, len(origins))]
+            chosen |= {origin for _, origin in first_origins}
         return chosen
 
 
-def _origin(known: Known) -> tuple[str, str]:
-    """A task, and which of its human demonstrations an episode comes from."""
-    return known.demo.rpartition("/")[0], known.origin or known.demo
+def _origin(facts: Known) -> tuple[str, str]:
+    """Return the task of an episode, and the origin of its demonstration."""
+    return facts.demo.rpartition("/")[0], facts.origin or facts.demo
 
 
 def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:
-    """The pieces of one dataset whose files say how many episodes and steps come before theirs.
+    """Return the pieces of one dataset, with the numbers of preceding episodes and steps that their files state.
 
     Args:
         slices: path of each piece, in order, to its split and its episodes.
+        known: episode id to the facts about the episode.
     """
     pieces: list[Piece] = []
     tasks: dict[str, int] = {}
     for path, (split_name, ids) in slices.items():
         before = pieces[-1] if pieces else Piece("", ())
-        texts = [known[one].instruction for one in ids]
-        pieces.append(
-            Piece(
-                path,
-                ids,
-                split_name,
-                len(pieces),
-                before.first_episode + len(before.ids),
-                before.first_step + before.steps,
-                sum(known[one].steps for one in ids),
-                {text: tasks.setdefault(text, len(tasks)) for text in texts},
-            )
+        numbers: dict[str, int] = {}
+        for episode_id in ids:
+            text = known[episode_id].instruction
+            numbers[text] = tasks.setdefault(text, len(tasks))
+        piece = Piece(
+            path,
+            ids,
+            split_name,
+            number=len(pieces),
+            first_episode=before.first_episode + len(before.ids),
+            first_step=before.first_step + before.steps,
+            steps=sum(known[episode_id].steps for episode_id in ids),
+            tasks=numbers,
         )
+        pieces.append(piece)
     return pieces
 
 
 def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
-    """Contiguous slices whose sizes differ by at most one, so that their concatenation keeps the caller's order.
+    """Divide episodes into contiguous slices whose sizes differ by at most one.
 
-    There are ``pieces`` of them, or one per episode when there are fewer episodes than that.
+    Their concatenation keeps the caller's order. The number of slices is ``pieces``, or the number of episodes if that
+    is smaller.
     """
     count = min(pieces, len(episode_ids))
     bounds = [len(episode_ids) * k // count for k in range(count + 1)]
@@ -149,10 +158,13 @@ def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
 
 
 def by_suite(suites: Mapping[str, str], name: str) -> dict[str, list[str]]:
-    """Set name to its episodes, in the caller's order: a set for each suite, so that clients train on one or on all.
+    """Group episodes into a set for each suite, in the caller's order, so that clients train on one suite or on all.
 
     Args:
         suites: episode id to LIBERO suite.
-        name: what the sets' names begin with; ``libero_spatial`` comes into ``<name>_spatial``.
+        name: prefix of the sets' names; the set of ``libero_spatial`` is ``<name>_spatial``.
+
+    Returns:
+        Set name to its episodes.
     """
-    return grouped((f"{name}_{suite.removeprefix('libero_')}", one) for one, suite in suites.items())
+    return grouped((f"{name}_{suite.removeprefix('libero_')}", episode_id) for episode_id, suite in suites.items())

@@ -19,7 +19,7 @@ from pipeline.tables import column
 
 
 class LeRobot(Format[LeRobotConfig]):
-    """Files of one number hold the same episodes: of data, of each video and of ``meta/episodes``."""
+    """Dataset in which files of one number hold the same episodes: of data, of each video and of ``meta/episodes``."""
 
     name: ClassVar[Step] = "lerobot"
     title: ClassVar = "LeRobot"
@@ -29,7 +29,7 @@ class LeRobot(Format[LeRobotConfig]):
     keys = (
         {view: spec.lerobot_key for view, spec in SCHEMA.views.items()}
         | {name: getattr(SCHEMA, name).lerobot_key for name in MOTION}
-        | {f"{view}_{own}": camera_column(view, own) for view in SCHEMA.views for own in (*MATRICES, *MAPS)}
+        | {f"{view}_{name}": camera_column(view, name) for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
         | {"provenance": "meta/provenance.parquet"}
     )
     clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
@@ -44,15 +44,19 @@ class LeRobot(Format[LeRobotConfig]):
 
     @property
     def root(self) -> Path:
-        """For ``LeRobotDataset(repo_id, root=root)``."""
+        """Return the folder for ``LeRobotDataset(repo_id, root=root)``."""
         return self.folder / self.options.name
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
-        """A piece is one file of each kind; lerobot's splits are ranges of episodes, one after the other."""
+        """Divide the episodes into pieces, each one file of each kind.
+
+        lerobot's splits are consecutive ranges of episodes.
+        """
         slices: dict[str, tuple[str, Sequence[str]]] = {}
         for split_name, members in episodes.by_split(self.options.validation).items():
             share = round((self.options.shards or 0) * len(members) / len(episodes.known))
-            least = ceil(sum(episodes.known[one].steps for one in members) / self._steps_of_a_file())
+            steps = sum(episodes.known[episode_id].steps for episode_id in members)
+            least = ceil(steps / self._steps_of_a_file())
             for ids in split(members, max(1, share, least)):
                 slices[f"files/{len(slices):05d}"] = split_name, ids
         return in_a_row(slices, episodes.known)
@@ -61,10 +65,11 @@ class LeRobot(Format[LeRobotConfig]):
         return {self.options.name}
 
     def _steps_of_a_file(self) -> int:
-        """So many steps make a file of ``FILE_MB`` at most; sizes as in ``benchmarks/disk.py``, rounded up."""
+        """Return the number of steps in a file of ``FILE_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
         views = len(SCHEMA.views)
         maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in self.extras)
-        data_kb = 0.5 + views * (maps_kb + (40.0 if self.options.frames == "images" else 0.0))
+        images_kb = 40.0 if self.options.frames == "images" else 0.0
+        data_kb = 0.5 + views * (maps_kb + images_kb)
         return int(1000 * FILE_MB / max(data_kb, 12.0))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
@@ -96,18 +101,18 @@ class LeRobot(Format[LeRobotConfig]):
         return lerobot_read.read(self.root, row["episode_id"], self.extras)
 
     def repository_path(self, file: str) -> str:
-        # lerobot looks at the root of the repository.
+        # lerobot reads a dataset from the root of the repository.
         return file.removeprefix(f"{self.options.name}/")
 
     def repository_folders(self) -> set[str]:
         return {"data", "meta", "videos"}
 
     def tag(self) -> str:
-        """What lerobot's loader looks for."""
+        """Return the tag that lerobot's loader requires."""
         return str(json.loads((self.root / "meta" / "info.json").read_text())["codebase_version"])
 
     def viewer(self) -> list[dict[str, str]]:
-        # As lerobot's own upload has it.
+        # lerobot's own upload contains this entry.
         return [{"config_name": "default", "data_files": "data/*/*.parquet"}]
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:

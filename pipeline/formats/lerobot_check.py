@@ -1,4 +1,4 @@
-"""A LeRobot dataset as a whole, and samples of it, as lerobot reads them."""
+"""Checks of a LeRobot dataset as a whole, and of samples as lerobot reads them."""
 
 import json
 import warnings
@@ -26,13 +26,13 @@ from pipeline.formats.read_back import Fault, in_both_splits, sampled, unlike
 from pipeline.types import Extra
 
 BY_LEROBOT = 8
-"""So many episodes are read by lerobot too, spread over the dataset."""
+"""Number of episodes that lerobot reads too, spread over the dataset."""
 
 SAME_LEVELS = 1
-"""Largest difference of a decoded frame between PyAV and what lerobot decodes with."""
+"""Largest difference in grey levels of a frame between PyAV and lerobot's decoder."""
 
 FILES_OF_A_CHUNK, PLACE = 1000, "chunk-{chunk_index:03d}/file-{file_index:03d}"
-"""lerobot's own, which its tools for editing go on with."""
+"""lerobot's own values, which its tools for editing continue to use."""
 
 
 def check(
@@ -43,9 +43,11 @@ def check(
     extras: Sequence[Extra] = (),
     validation: float = 0.0,
 ) -> Iterator[tuple[str, Fault]]:
-    """Compare a dataset as a whole with what its files hold: every field of ``meta/info.json`` and ``modality.json``,
-    the tasks, the splits, the files, the videos' own properties, and the statistics of all columns, computed again.
-    lerobot opens it, and samples are the very numbers and frames that ``lerobot_read.read`` finds.
+    """Compare a dataset's metadata with the content of its files.
+
+    The check covers every field of ``meta/info.json`` and ``modality.json``, the tasks, the splits, the files, and the
+    videos' own properties. It computes the statistics of all columns again. lerobot opens the dataset; its numbers and
+    frames of samples must equal those of ``lerobot_read.read``.
 
     Args:
         validation: share of the demonstrations in the split ``val``.
@@ -53,12 +55,12 @@ def check(
     Raises:
         PipelineError: when the dataset cannot be opened.
     """
-    # lerobot decodes through it, and each worker would print that it will go.
+    # lerobot decodes by torchvision, which prints in each worker that its video decoding is deprecated.
     warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
     with readable(root):
         episodes = rows(root)
         faults = list(_format(root, episodes, convention, extras, validation))
-    # First, as lerobot may stop at them with less to say.
+    # These faults come first, because lerobot may stop at them with a less specific message.
     yield from (("format", fault) for fault in faults)
     with readable(root, also=(DatasetsError,)):
         with local_only(cache):
@@ -73,9 +75,9 @@ def check(
         yield "format", Fault("lerobot", episode_id, f"lerobot reads another {key}", "what its files hold")
     wanted_steps = sum(row["steps"] for row in kept.values())
     if stored != (len(kept), wanted_steps):
-        found = f"{stored[0]} episodes of {stored[1]} steps"
-        yield "ids", Fault("lerobot", None, found, f"{len(kept)} of {wanted_steps}")
-    # One that is missing is told where it is looked for.
+        size = f"{stored[0]} episodes of {stored[1]} steps"
+        yield "ids", Fault("lerobot", None, size, f"{len(kept)} of {wanted_steps}")
+    # Reading the episodes reports missing ones.
     for episode_id in sorted(episodes.keys() - kept.keys()):
         yield "ids", Fault("lerobot", episode_id, "is in the dataset", "kept episodes alone")
     yield from in_both_splits("lerobot", split_of, kept)
@@ -84,7 +86,7 @@ def check(
 def _format(
     root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention, extras: Sequence[Extra], val: float
 ) -> Iterator[Fault]:
-    """Compare what ``meta/`` states with the files and with the episodes."""
+    """Compare the statements of ``meta/`` with the files and with the episodes."""
     info = json.loads((root / "meta" / "info.json").read_text())
     tasks = pq.read_table(root / "meta" / "tasks.parquet").to_pylist()
     steps = sum(row["length"] for row in episodes.values())
@@ -104,8 +106,9 @@ def _format(
     yield from unlike("lerobot", info, wanted)
     yield from unlike("lerobot", {"fields of info.json": sorted(info)}, {"fields of info.json": _fields(wanted)})
     yield from unlike("lerobot", info["features"], as_json(described(convention, extras)))
-    if strange := sorted(info["features"].keys() - convention.columns(extras).keys()):
-        yield Fault("lerobot", None, f"columns {strange} are described", "those of the data files")
+    unexpected = sorted(info["features"].keys() - convention.columns(extras).keys())
+    if unexpected:
+        yield Fault("lerobot", None, f"columns {unexpected} are described", "those of the data files")
     yield from wrong_tasks("lerobot", tasks, [row["tasks"][0] for row in episodes.values()])
     yield from _wrong_splits(info["splits"], len(episodes), val)
     yield from wrong_modality("lerobot", root, info["features"], convention)
@@ -119,27 +122,34 @@ def _fields(wanted: Mapping[str, Any]) -> list[str]:
 
 
 def _wrong_splits(splits: Mapping[str, str], episodes: int, validation: float) -> Iterator[Fault]:
-    """Compare the ranges of the splits with the episodes, all of which are in one of them, ``train`` first."""
+    """Compare the ranges of the splits with the episodes: ``train`` first, and each episode in one split."""
     names = ["train", "val"] if validation else ["train"]
-    ends = [tuple(int(end) for end in text.split(":")) for text in splits.values()]
-    begins = [0, *(end for _, end in ends)]
-    whole = [begin for begin, _ in ends] == begins[:-1] and begins[-1] == episodes and all(a < b for a, b in ends)
-    if [*splits] != names or not whole:
+    firsts, ends = [], []
+    for text in splits.values():
+        first, end = map(int, text.split(":"))
+        firsts.append(first)
+        ends.append(end)
+    bounds = [0, *ends]
+    is_complete = firsts == bounds[:-1] and bounds[-1] == episodes
+    is_filled = all(first < end for first, end in zip(firsts, ends, strict=True))
+    if [*splits] != names or not (is_complete and is_filled):
         yield Fault("lerobot", None, f"splits is {dict(splits)}", f"{' and '.join(names)}, of 0 to {episodes} in all")
 
 
 def _split_of(root: Path, episodes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Episode id to the name of its split."""
+    """Return the name of each episode's split, by episode id."""
     splits = json.loads((root / "meta" / "info.json").read_text())["splits"]
-    found: dict[str, str] = {}
+    split_of: dict[str, str] = {}
     for name, text in splits.items():
-        first, end = (int(number) for number in text.split(":"))
-        found |= {one: name for one, row in episodes.items() if first <= row["episode_index"] < end}
-    return found
+        first, end = map(int, text.split(":"))
+        for episode_id, row in episodes.items():
+            if first <= row["episode_index"] < end:
+                split_of[episode_id] = name
+    return split_of
 
 
 def _wrong_files(root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention) -> Iterator[Fault]:
-    """Compare the files that are there with those that the episodes name."""
+    """Compare the existing files with those that the episodes name."""
     kinds = {"data": ".parquet", "meta/episodes": ".parquet"}
     if convention.frames == "video":
         kinds |= {f"videos/{view.lerobot_key}": ".mp4" for view in SCHEMA.views.values()}
@@ -148,28 +158,35 @@ def _wrong_files(root: Path, episodes: Mapping[str, Mapping[str, Any]], conventi
         for kind, suffix in kinds.items():
             place = PLACE.format(chunk_index=row[f"{kind}/chunk_index"], file_index=row[f"{kind}/file_index"])
             wanted.add(f"{kind}/{place}{suffix}")
-    found = [file for folder in ("data", "videos", "meta/episodes") for file in (root / folder).rglob("*")]
-    there = {file.relative_to(root).as_posix() for file in found if file.is_file()}
-    yield from unlike("lerobot", {"files": sorted(there)}, {"files": sorted(wanted)})
+    existing = set()
+    for folder in ("data", "videos", "meta/episodes"):
+        for file in (root / folder).rglob("*"):
+            if file.is_file():
+                existing.add(file.relative_to(root).as_posix())
+    yield from unlike("lerobot", {"files": sorted(existing)}, {"files": sorted(wanted)})
 
 
 def _wrong_statistics(root: Path, convention: Convention, extras: Sequence[Extra]) -> Iterator[tuple[str, str]]:
-    """Compare ``meta/stats.json`` with all steps, and for frames with the statistics of the episodes."""
+    """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
     yield from wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(extras))
     for view in SCHEMA.views.values():
         column = view.lerobot_key
-        names = [f"stats/{column}/{name}" for name in (*FIGURES, *QUANTILES)]
+        names = [f"stats/{column}/{figure}" for figure in (*FIGURES, *QUANTILES)]
         tables = [pq.read_table(file, columns=names) for file in episode_files(root)]
-        read = {name: np.array([value for table in tables for value in table[name].to_pylist()]) for name in names}
-        of_episodes = {name.rpartition("/")[2]: values.reshape(len(values), -1) for name, values in read.items()}
+        of_episodes = {}
+        for name in names:
+            values = np.array([value for table in tables for value in table[name].to_pylist()])
+            figure = name.rpartition("/")[2]
+            of_episodes[figure] = values.reshape(len(values), -1)
         yield from wrong_frames(column, stored[column], of_episodes)
 
 
 def _samples(root: Path, data: LeRobotDataset) -> Iterator[tuple[str, str]]:
-    """Episode and column where lerobot hands out something else than ``copy_of`` at the sampled steps."""
+    """List each episode and column in which lerobot and ``copy_of`` differ at the sampled steps."""
     episodes = sorted(rows(root).values(), key=lambda row: row["episode_index"])
-    for place in sorted({round(k) for k in np.linspace(0, len(episodes) - 1, BY_LEROBOT)}):
+    places = {round(place) for place in np.linspace(0, len(episodes) - 1, BY_LEROBOT)}
+    for place in sorted(places):
         row = episodes[place]
         copy = copy_of(root, row, ())
         for step in sampled(row["length"]):
@@ -179,9 +196,9 @@ def _samples(root: Path, data: LeRobotDataset) -> Iterator[tuple[str, str]]:
                 if not np.array_equal(item[key].numpy(), getattr(copy.episode, name)[step]):
                     yield row[EPISODE_ID], key
             for view, spec in SCHEMA.views.items():
-                # lerobot hands out floats in [0, 1], channels first.
-                shown = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
-                if np.abs(shown - copy.frame(view, step)).max() > SAME_LEVELS:
+                # lerobot returns floats in [0, 1], channels first.
+                frame = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
+                if np.abs(frame - copy.frame(view, step)).max() > SAME_LEVELS:
                     yield row[EPISODE_ID], spec.lerobot_key
             if item["task"] != copy.instructions[step]:
                 yield row[EPISODE_ID], "task"
@@ -189,7 +206,7 @@ def _samples(root: Path, data: LeRobotDataset) -> Iterator[tuple[str, str]]:
 
 @contextmanager
 def local_only(cache: Path) -> Iterator[None]:
-    """Keep the copies that ``datasets`` makes of what lerobot reads out of the home folder, and lerobot off the hub."""
+    """Keep lerobot off the hub, and keep the copies of ``datasets`` out of the home folder."""
     with (
         mock.patch.object(datasets.config, "HF_DATASETS_CACHE", cache),
         mock.patch.object(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
@@ -203,5 +220,8 @@ def local_only(cache: Path) -> Iterator[None]:
 
 
 def forget_sessions() -> None:
-    """Before huggingface-hub 1, a thread keeps a session, which stays on or off the hub as it was made."""
+    """Discard the session of huggingface-hub before version 1.
+
+    A thread keeps its session, which stays online or offline as it was created.
+    """
     getattr(huggingface_hub, "configure_http_backend", lambda: None)()

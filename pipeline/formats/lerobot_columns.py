@@ -1,4 +1,4 @@
-"""The columns of LeRobot datasets: of v3.0, and of v2.1 in the conventions in use. Light to import."""
+"""Columns of LeRobot datasets: of v3.0, and of v2.1 in the conventions in use. This module is light to import."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -8,35 +8,37 @@ from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, MatrixSpec, 
 from pipeline.types import Extra
 
 Frames = Literal["video", "images"]
-"""``video`` is H.264 made from the stored frames; ``images`` are the stored JPEG files, three times as large."""
+"""``video`` is H.264 encoded from the stored frames; ``images`` are the stored JPEG files, three times as large."""
 
 EPISODE_ID = "episode_id"
-"""A column of every frame, because lerobot's tools to delete, split and merge number episodes anew and leave
-``meta/provenance.parquet`` behind: with it, an episode is still found in the manifest."""
+"""A column of every frame, by which an episode is still found in the manifest after an edit. lerobot's tools to delete,
+split and merge number episodes again and do not keep ``meta/provenance.parquet``."""
 
 INSTANCES, OBJECT_POSES = "instances", "object_poses"
-"""With extras: a JSON list of names in ``meta/provenance.parquet``, and in every frame the poses of what it names."""
+"""Columns of extras: a JSON list of names in ``meta/provenance.parquet``, and the poses of the named objects in every
+frame."""
 
 FILE_MB = 200
-"""About as large as a file of data or video may become."""
+"""Approximate largest size of a file of data or video."""
 
 LANGUAGE = "language_persistent"
-"""lerobot's column of what is said of an episode: all of it in every frame, from lerobot 0.6 on."""
+"""lerobot's column of an episode's language annotations, all of them in every frame, from lerobot 0.6 on."""
 
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
-"""lerobot's own columns of every frame, beside ``timestamp``."""
+"""lerobot's own columns of every frame, in addition to ``timestamp``."""
 
 
 def camera_column(view: str, name: str) -> str:
-    """The column with a view's matrix (row by row, in ``meta/provenance.parquet``) or map (PNG in base64, every frame).
+    """Return the column with a view's matrix or map.
 
-    Maps are text, and no name begins with ``observation``, because lerobot's policies take such columns and all images.
+    A matrix is stored row by row in ``meta/provenance.parquet``, a map as PNG in base64 in every frame. Maps are text,
+    and no name begins with ``observation``, because lerobot's policies use such columns and all images as inputs.
     """
     return f"{SCHEMA.views[view].lerobot_camera}.{name}"
 
 
 def matrix_columns() -> dict[str, MatrixSpec]:
-    """The columns of ``meta/provenance.parquet`` with what an episode's cameras have once."""
+    """Return the columns of ``meta/provenance.parquet`` with the matrices of an episode's cameras."""
     return {camera_column(view, name): getattr(SCHEMA, name) for view in SCHEMA.views for name in MATRICES}
 
 
@@ -48,14 +50,15 @@ def _flat(spec: PosesSpec) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Convention:
-    """What clients expect of a set.
+    """Layout of a set that clients expect.
 
     Attributes:
-        robot_type: in ``meta/info.json``.
-        names: columns that have another name than in v3.0.
-        open_is_one: whether the gripper's command is 1 open, 0 closed, and not as LIBERO has it. GR00T and starVLA,
-            which look for ``meta/modality.json``, take it so.
-        language: whether there is lerobot's language column.
+        frames: storage of the frames.
+        robot_type: robot type in ``meta/info.json``.
+        names: column of v3.0 to its name here, where the names differ.
+        open_is_one: True if the gripper's command is 1 open, 0 closed, instead of LIBERO's. GR00T and starVLA, which
+            read ``meta/modality.json``, expect it.
+        language: True if the set has lerobot's language column.
     """
 
     frames: Frames
@@ -65,11 +68,11 @@ class Convention:
     language: bool = False
 
     def name(self, column: str) -> str:
-        """Of a column of v3.0."""
+        """Return the name of a column of v3.0."""
         return self.names.get(column, column)
 
     def columns(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
-        """The columns of every frame, as ``meta/info.json`` describes them."""
+        """Describe the columns of every frame, as ``meta/info.json`` does."""
         frame = {"dtype": "video", "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
         if self.frames == "images":
             frame["dtype"] = "image"
@@ -79,14 +82,15 @@ class Convention:
             spec = getattr(SCHEMA, name)
             columns[spec.lerobot_key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
         columns[EPISODE_ID] = dict(text)
-        columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in MAPS if name in extras}
+        maps = [name for name in MAPS if name in extras]
+        columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in maps}
         if "object_poses" in extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
         if self.language:
             columns[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
         columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}
         columns |= {name: dict(number) for name in COUNTERS}
-        return {self.name(column): of for column, of in columns.items()}
+        return {self.name(column): description for column, description in columns.items()}
 
 
 CONVENTIONS = {
@@ -108,13 +112,13 @@ CONVENTIONS = {
         },
     ),
 }
-"""Each as its public code has it. Joint angles are in neither; under ``observation`` they would be a policy's input.
+"""Conventions of public code. Neither has joint angles; under ``observation`` they would be a policy's input.
 
-* ``ipec``, of IPEC-COMMUNITY's ``libero_*_no_noops_1.0.0_lerobot``, which cannot be had here. They were made by
-  ``openx2lerobot/openx_rlds.py`` and its ``libero_dataset_transform`` (Tavish9/any4lerobot at 6937315): a set for each
-  suite, videos, 20 Hz, gripper 1 open and 0 closed. ``examples/simBenchmarks/LIBERO/train_files`` in starVLA/starVLA at
-  0ed0aad names the columns, and ``eval_files/eval_libero.py`` there turns the gripper back.
-* ``openpi``, of ``examples/libero/convert_libero_data_to_lerobot.py`` (Physical-Intelligence/openpi at 15a9616), as
-  ``LeRobotLiberoDataConfig`` in ``src/openpi/training/config.py`` repacks it: one set, images in the data files,
-  gripper as LIBERO has it. openpi writes a frame rate of 10; here it is LIBERO's 20 Hz, which its loader takes too.
+* ``ipec``: the convention of IPEC-COMMUNITY's ``libero_*_no_noops_1.0.0_lerobot``, which are not available here.
+  ``openx2lerobot/openx_rlds.py`` and its ``libero_dataset_transform`` (Tavish9/any4lerobot at 6937315) generated them:
+  a set for each suite, videos, 20 Hz, gripper 1 open and 0 closed. ``examples/simBenchmarks/LIBERO/train_files`` in
+  starVLA/starVLA at 0ed0aad names the columns, and ``eval_files/eval_libero.py`` there inverts the gripper again.
+* ``openpi``: the convention of ``examples/libero/convert_libero_data_to_lerobot.py`` (Physical-Intelligence/openpi at
+  15a9616), as ``LeRobotLiberoDataConfig`` in ``src/openpi/training/config.py`` repacks it: one set, images in the data
+  files, LIBERO's gripper. openpi writes a frame rate of 10; here it is LIBERO's 20 Hz, which its loader accepts too.
 """

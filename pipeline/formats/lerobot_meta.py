@@ -1,4 +1,4 @@
-"""Files of ``meta/`` that both versions of LeRobot have, compared with what they are about."""
+"""Checks of the files of ``meta/`` that both versions of LeRobot have."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,18 +14,21 @@ from pipeline.formats.read_back import Fault, unlike
 
 
 def as_json(value: Any) -> Any:
-    """Convert a value to what a JSON file gives back of it."""
+    """Convert a value to the value that a JSON file returns for it."""
     return json.loads(json.dumps(value))
 
 
 def described(convention: Convention, extras: Sequence[Any]) -> dict[str, Any]:
-    """The columns as ``meta/info.json`` describes them, videos with what they are encoded with."""
-    columns = convention.columns(extras)
-    return {name: {**of, **({"info": INFO} if of["dtype"] == "video" else {})} for name, of in columns.items()}
+    """Describe the columns as ``meta/info.json`` should, videos with the properties of their encoding."""
+    columns = {}
+    for name, description in convention.columns(extras).items():
+        encoding = {"info": INFO} if description["dtype"] == "video" else {}
+        columns[name] = {**description, **encoding}
+    return columns
 
 
 def wrong_tasks(dataset: str, tasks: Sequence[Mapping[str, Any]], used: Sequence[str]) -> Iterator[Fault]:
-    """Compare the numbered tasks with the texts that the episodes have."""
+    """Compare the numbered tasks with the instructions of the episodes."""
     numbers, texts = [row["task_index"] for row in tasks], [row["task"] for row in tasks]
     yield from unlike(dataset, {"tasks": sorted(texts)}, {"tasks": sorted(set(used))})
     yield from unlike(dataset, {"task_index": numbers}, {"task_index": [*range(len(tasks))]})
@@ -34,7 +37,7 @@ def wrong_tasks(dataset: str, tasks: Sequence[Mapping[str, Any]], used: Sequence
 def wrong_modality(
     dataset: str, root: Path, features: Mapping[str, Mapping[str, Any]], convention: Convention
 ) -> Iterator[Fault]:
-    """Compare ``meta/modality.json`` with the columns: parts that cover a vector in order, and views of the cameras."""
+    """Compare ``meta/modality.json`` with the columns: parts cover a vector in order, and views are the cameras."""
     modality = json.loads((root / "meta" / "modality.json").read_text())
     pose = ["x", "y", "z", "roll", "pitch", "yaw"]
     for name, spec, parts in (
@@ -44,15 +47,16 @@ def wrong_modality(
         column = convention.name(spec.lerobot_key)
         width = features[column]["shape"][0]
         wanted = [(part, k, k + 1, column) for k, part in zip(range(width), parts, strict=True)]
-        read = [(part, of["start"], of["end"], of["original_key"]) for part, of in modality[name].items()]
+        entries = modality[name].items()
+        read = [(part, entry["start"], entry["end"], entry["original_key"]) for part, entry in entries]
         yield from unlike(dataset, {f"{name} of modality.json": read}, {f"{name} of modality.json": wanted})
-    views = {view: convention.name(of.lerobot_key) for view, of in SCHEMA.views.items()}
+    views = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
     columns = {
         "video": {"primary_image": views["image"], **views},
         "annotation": {"human.action.task_description": "task_index"},
     }
     for name, wanted_keys in columns.items():
-        keys = {part: of["original_key"] for part, of in modality[name].items()}
+        keys = {part: entry["original_key"] for part, entry in modality[name].items()}
         yield from unlike(dataset, {f"{name} of modality.json": keys}, {f"{name} of modality.json": wanted_keys})
     yield from unlike(dataset, {"parts of modality.json": [*modality]}, {"parts of modality.json": [*_PARTS]})
 
@@ -61,7 +65,7 @@ _PARTS = ("state", "action", "video", "annotation")
 
 
 def wrong_video(dataset: str, file: Path, stated: Mapping[str, Any]) -> Iterator[Fault]:
-    """Compare a video with what ``meta/info.json`` states of it."""
+    """Compare a video with the properties that ``meta/info.json`` states."""
     with av.open(str(file)) as video:
         stream = video.streams.video[0]
         read = {

@@ -1,4 +1,4 @@
-"""LeRobot datasets read an episode at a time, by pyarrow and PyAV; lerobot itself reads in ``lerobot_check.py``."""
+"""Reader of single episodes of LeRobot datasets by pyarrow and PyAV; lerobot itself reads in ``lerobot_check.py``."""
 
 import base64
 import json
@@ -34,20 +34,20 @@ UNREADABLE = (
     av.error.FFmpegError,
     pa.ArrowException,
 )
-"""What is raised on files that are damaged, missing or do not belong together."""
+"""Exceptions on files that are damaged, missing or do not belong together."""
 
 MARKS = ("frame_index", "timestamp")
-"""LeRobot's columns that tell steps apart."""
+"""LeRobot's columns that distinguish steps."""
 
 NUMBERS = ("float32", "int64")
 """Types of the columns that have statistics, in addition to frames."""
 
 
 def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
-    """An episode with these extras; None when the dataset does not have it.
+    """Read an episode with these extras; ``None`` when the dataset does not have it.
 
     Raises:
-        PipelineError: when it cannot be read.
+        PipelineError: when the episode cannot be read.
     """
     with readable(root):
         row = rows(root).get(episode_id)
@@ -56,7 +56,7 @@ def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
 
 @contextmanager
 def readable(root: Path, version: str = "v3.0", also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn what damaged or missing files raise, by ``UNREADABLE`` or ``also``, into the error that says so."""
+    """Convert the exceptions of damaged or missing files, ``UNREADABLE`` and ``also``, to an error that names them."""
     try:
         yield
     except (*UNREADABLE, *also) as error:
@@ -66,24 +66,30 @@ def readable(root: Path, version: str = "v3.0", also: tuple[type[Exception], ...
 
 
 def rows(root: Path) -> dict[str, dict[str, Any]]:
-    """Episode id to its rows of ``meta/episodes`` and of ``meta/provenance.parquet``."""
+    """Read the rows of ``meta/episodes`` and of ``meta/provenance.parquet``, merged, by episode id."""
     return _opened(edition(root / "meta" / "info.json"))[1]
 
 
 @lru_cache(maxsize=1)
 def _opened(info_file: Edition) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """``meta/info.json`` with the tasks by number, and what ``rows`` gives."""
+    """Read ``meta/info.json``, with the tasks by number, and the result of ``rows``."""
     meta = info_file.path.parent
     info: dict[str, Any] = json.loads(info_file.path.read_text())
     info["tasks"] = {row["task_index"]: row["task"] for row in pq.read_table(meta / "tasks.parquet").to_pylist()}
     files = episode_files(meta.parent)
     names = [name for name in pq.read_schema(files[0]).names if not name.startswith("stats/")]
-    episodes = [row for file in files for row in pq.read_table(file, columns=names).to_pylist()]
+    episodes: list[dict[str, Any]] = []
+    for file in files:
+        episodes += pq.read_table(file, columns=names).to_pylist()
     provenance = pq.read_table(meta / "provenance.parquet").to_pylist()
     firsts: dict[tuple[int, int], int] = {}
     for row in episodes:
-        row["first_row"] = row["dataset_from_index"] - firsts.setdefault(_file(row), row["dataset_from_index"])
-    return info, {also[EPISODE_ID]: row | also for row, also in zip(episodes, provenance, strict=True)}
+        first_of_file = firsts.setdefault(_file(row), row["dataset_from_index"])
+        row["first_row"] = row["dataset_from_index"] - first_of_file
+    by_id = {}
+    for row, labels in zip(episodes, provenance, strict=True):
+        by_id[labels[EPISODE_ID]] = row | labels
+    return info, by_id
 
 
 def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
@@ -91,7 +97,7 @@ def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
 
 
 def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy:
-    """An episode of ``rows``."""
+    """Read an episode, given its row of ``rows``."""
     index, steps = row["episode_index"], row["length"]
     info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)
@@ -99,14 +105,15 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
     refuse_others(table, row, row["dataset_from_index"])
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
     if row["dataset_to_index"] != row["dataset_from_index"] + steps or row["tasks"] != [instructions[0]]:
-        told = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
-        raise ValueError(f"episode {index} of {steps} steps, {instructions[0]!r}, {told}")
+        stated = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
+        raise ValueError(f"episode {index} of {steps} steps, {instructions[0]!r}, {stated}")
     videos = {}
-    for view, key in ((view, spec.lerobot_key) for view, spec in SCHEMA.views.items()):
+    for view, spec in SCHEMA.views.items():
+        key = spec.lerobot_key
         if info["features"][key]["dtype"] == "video":
             chunk, number = _file(row, f"videos/{key}")
             path = root / info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
-            first_s, end_s = (row[f"videos/{key}/{end}_timestamp"] for end in ("from", "to"))
+            first_s, end_s = row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"]
             if round((end_s - first_s) * SCHEMA.fps_hz) != steps:
                 raise ValueError(f"episode {index} of {steps} steps has {first_s} to {end_s} s of {path.name}")
             videos[view] = path, first_s
@@ -120,10 +127,10 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
         train=index < int(info["splits"]["train"].partition(":")[2]),
         statistics=Statistics(
-            _statistics(root, row),
-            {name: matrix(table, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
-            {view: spec.lerobot_key for view, spec in SCHEMA.views.items()},
-            QUANTILES,
+            stored=_statistics(root, row),
+            numbers={name: matrix(table, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
+            views={view: spec.lerobot_key for view, spec in SCHEMA.views.items()},
+            quantiles=QUANTILES,
         ),
     )
 
@@ -134,7 +141,7 @@ def episode_files(root: Path) -> list[Path]:
 
 
 def _statistics(root: Path, row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Read what ``meta/episodes`` states of an episode's columns."""
+    """Read the statistics of an episode's columns in ``meta/episodes``."""
     chunk, number = _file(row, "meta/episodes")
     table, places = _stated(edition(root / f"meta/episodes/chunk-{chunk:03d}/file-{number:03d}.parquet"))
     (values,) = table.slice(places[row["episode_index"]], 1).to_pylist()
@@ -147,7 +154,7 @@ def _statistics(root: Path, row: Mapping[str, Any]) -> dict[str, dict[str, Any]]
 
 @lru_cache(maxsize=2)
 def _stated(file: Edition) -> tuple[pa.Table, dict[int, int]]:
-    """The statistics in a file of ``meta/episodes``, and the number of each episode to its place there."""
+    """Read the statistics in a file of ``meta/episodes``, and each episode's number to its place in the file."""
     names = [name for name in pq.read_schema(file.path).names if name.startswith("stats/")]
     table = pq.read_table(file.path, columns=["episode_index", *names])
     places = {index: place for place, index in enumerate(table["episode_index"].to_pylist())}
@@ -155,13 +162,15 @@ def _stated(file: Edition) -> tuple[pa.Table, dict[int, int]]:
 
 
 def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> None:
-    """Refuse steps that are not all of an episode, by their own numbers and id.
+    """Reject steps that are not exactly those of an episode, by the steps' own numbers and id.
 
     Args:
-        first_step: so many steps of the dataset come before it.
+        table: the steps.
+        row: the episode's row of ``rows``.
+        first_step: number of preceding steps of the dataset.
 
     Raises:
-        ValueError: naming the column that says so.
+        ValueError: naming the column that differs.
     """
     index, steps = row["episode_index"], row["length"]
     wanted = {"episode_index": [index] * steps, EPISODE_ID: [row[EPISODE_ID]] * steps}
@@ -172,94 +181,104 @@ def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
 
 
 def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...]) -> Episode:
-    """An episode, from v3.0's columns of its steps and its row of ``meta/provenance.parquet``; frames where those are
-    image files."""
+    """Return an episode, given v3.0's columns of its steps and its row of ``meta/provenance.parquet``.
+
+    The episode has frames only where they are stored as image files.
+    """
+    frames = {}
+    for view, spec in SCHEMA.views.items():
+        if spec.lerobot_key in table.column_names:
+            frames[view] = [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
     return Episode(
         episode_id=row[EPISODE_ID],
-        frames={
-            view: [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
-            for view, spec in SCHEMA.views.items()
-            if spec.lerobot_key in table.column_names
-        },
+        frames=frames,
         state=matrix(table, SCHEMA.state.lerobot_key),
         joint_state=matrix(table, SCHEMA.joint_state.lerobot_key),
         action=matrix(table, SCHEMA.action.lerobot_key),
         instruction=instruction,
         provenance=row,
         geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},
-        object_poses=matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
-        if "object_poses" in extras
-        else None,
+        object_poses=_object_poses(table) if "object_poses" in extras else None,
         instances=json.loads(row[INSTANCES]) if named(extras) else (),
     )
 
 
 def _steps(path: Path, first: int, steps: int) -> pa.Table:
-    """Rows of a data file, from the row groups that have them: where we wrote the file, that is one."""
+    """Read rows of a data file from the row groups that contain them: a single one in files of our writer."""
     footer, ends = _footer(edition(path))
     with pq.ParquetFile(path, metadata=footer) as file:
-        groups = range(
-            int(np.searchsorted(ends, first, "right")), int(np.searchsorted(ends, first + steps - 1, "right")) + 1
-        )
+        first_group = int(np.searchsorted(ends, first, "right"))
+        last_group = int(np.searchsorted(ends, first + steps - 1, "right"))
+        groups = range(first_group, last_group + 1)
         before = int(ends[groups[0] - 1]) if groups[0] else 0
         return file.read_row_groups(list(groups), use_threads=False).slice(first - before, steps)
 
 
 @lru_cache(maxsize=4)
 def _footer(data_file: Edition) -> tuple[pq.FileMetaData, NDArray[np.int64]]:
-    """What a data file says of itself, and the rows at which its row groups end."""
+    """Read the metadata of a data file, and the rows at which its row groups end."""
     footer = pq.read_metadata(data_file.path)
     return footer, np.cumsum([footer.row_group(group).num_rows for group in range(footer.num_row_groups)])
 
 
+def _object_poses(table: pa.Table) -> NDArray[np.float32]:
+    return matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
+
+
 def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
-    matrices = {
-        name: np.array(row[camera_column(view, name)], np.float32).reshape(getattr(SCHEMA, name).shape)
-        for name in MATRICES
-    }
+    matrices = {}
+    for name in MATRICES:
+        numbers = np.array(row[camera_column(view, name)], np.float32)
+        matrices[name] = numbers.reshape(getattr(SCHEMA, name).shape)
     texts = {name: table[camera_column(view, name)].to_pylist() for name in MAPS if name in extras}
-    return Geometry(**matrices, maps={name: list(map(base64.b64decode, files)) for name, files in texts.items()})
+    maps = {name: list(map(base64.b64decode, files)) for name, files in texts.items()}
+    return Geometry(**matrices, maps=maps)
 
 
 def decoded(times_s: Sequence[float], videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:
-    """The frames at the sampled steps.
+    """Decode the frames at the sampled steps.
 
     Args:
-        times_s: those that stand at the steps, by which lerobot finds a frame.
-        videos: view to its video, and the time (s) at which the episode begins there.
+        times_s: timestamps of the steps, by which lerobot finds a frame.
+        videos: view to its video, and the time (s) at which the episode begins in the video.
+
+    Returns:
+        (view, step) to the frame.
     """
     steps = sampled(len(times_s))
-    return {
-        (view, step): frame
-        for view, (path, begins_s) in videos.items()
-        for step, frame in zip(steps, frames_at(path, [begins_s + times_s[step] for step in steps]), strict=True)
-    }
+    frames = {}
+    for view, (path, begins_s) in videos.items():
+        frames_of_view = frames_at(path, [begins_s + times_s[step] for step in steps])
+        for step, frame in zip(steps, frames_of_view, strict=True):
+            frames[view, step] = frame
+    return frames
 
 
 def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
-    """The frames of a video that begin at these times.
+    """Decode the frames of a video that begin at these times.
 
     Raises:
-        ValueError: when there is none.
+        ValueError: when no frame begins at a time.
     """
     video, frames = _video(edition(path)), []
     stream = video.streams.video[0]
     for at_s in times_s:
         at = round(at_s / float(stream.time_base or 1))
         video.seek(at, stream=stream)
-        found = next((frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at), None)
-        if found is None or found.pts != at:
+        from_then_on = (frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at)
+        frame = next(from_then_on, None)
+        if frame is None or frame.pts != at:
             raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
-        frames.append(np.asarray(found.to_ndarray(format="rgb24"), np.uint8))
+        frames.append(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8))
     return frames
 
 
 _VIDEOS: dict[Edition, av.container.InputContainer] = {}
-"""Those that are open, one of each view."""
+"""Open videos, one of each view."""
 
 
 def _video(file: Edition) -> av.container.InputContainer:
-    """A video that stays open for a while, as its next frames are likely to be asked for."""
+    """Open a video and keep it open for a while, because a caller probably asks for its next frames."""
     if file not in _VIDEOS:
         while len(_VIDEOS) >= len(SCHEMA.views):
             _VIDEOS.pop(next(iter(_VIDEOS))).close()

@@ -1,4 +1,4 @@
-"""Statistics that LeRobot datasets state, compared with the columns and with each other."""
+"""Comparison of the statistics in LeRobot datasets with the columns and with each other."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,17 +13,19 @@ FIGURES = ("count", "mean", "std", "min", "max")
 """lerobot's statistics."""
 
 QUANTILES = ("q01", "q10", "q50", "q90", "q99")
-"""Those of v3.0 in addition; pi0.5 normalises by them."""
+"""Additional statistics of v3.0; pi0.5 normalises by them."""
 
 SAME_SHARE, SAME = 1e-4, 1e-6
 """Largest relative and absolute difference between stored statistics and those of the columns."""
 
 MEAN_LEVELS, DEVIATION = 25.0, 1.5
-"""How far the mean (in 255 levels) and the deviation (as a quotient) of an episode's three sampled frames may be from
-those of all of its frames. Of 47 episodes of ``configs/starter.yaml`` the most was 10.0 and 1.12, in wrist views."""
+"""Largest difference between an episode's three sampled frames and all of its frames: of the mean, in 255 levels, and
+of the deviation, as a quotient. In 47 episodes of ``configs/starter.yaml`` the largest were 10.0 and 1.12, in wrist
+views.
+"""
 
 ENTRIES = 16
-"""Entries of a column that are in memory at a time."""
+"""Number of a column's entries that are in memory at a time."""
 
 Stored = Mapping[str, Any]
 """Statistics of one column as they are stored, by name."""
@@ -33,7 +35,7 @@ Wrong = Iterator[tuple[str, str]]
 
 
 def matrix(table: pa.Table, column: str) -> NDArray[Any]:
-    """Values (T, D) of a column of numbers or of vectors."""
+    """Return the values (T, D) of a column of numbers or of vectors."""
     values = table[column].combine_chunks()
     is_list = pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type)
     flat = values.flatten() if is_list else values
@@ -41,7 +43,7 @@ def matrix(table: pa.Table, column: str) -> NDArray[Any]:
 
 
 def complete(column: str, stored: Stored, names: Sequence[str], channels: int) -> Wrong:
-    """Compare which statistics of a column are stored with those that are to be, and their number of entries."""
+    """Compare the names of a column's stored statistics and their numbers of entries with the required ones."""
     sizes = {name: np.size(values) for name, values in stored.items()}
     wanted = {name: 1 if name == "count" else channels for name in names}
     if sizes != wanted:
@@ -49,20 +51,23 @@ def complete(column: str, stored: Stored, names: Sequence[str], channels: int) -
 
 
 def wrong_numbers(column: str, stored: Stored, values: NDArray[Any], quantiles: Sequence[str]) -> Wrong:
-    """Compare the stored statistics of a column, which are complete, with its values (N, D)."""
+    """Compare the stored statistics of a column, which must be complete, with its values (N, D)."""
     exact = values.astype(float)
     wanted = {name: getattr(exact, name)(axis=0) for name in ("mean", "std", "min", "max")}
     shares = [int(name[1:]) / 100 for name in quantiles]
     wanted |= dict(zip(quantiles, np.quantile(exact, shares, axis=0), strict=True))
-    for name, expected in (wanted | {"count": np.array([len(exact)])}).items():
+    wanted["count"] = np.array([len(exact)])
+    for name, expected in wanted.items():
         yield from _unlike(f"{name} of {column}", stored[name], expected)
 
 
 def wrong_in_dataset(stored: Mapping[str, Stored], files: Sequence[Path], columns: Mapping[str, Any]) -> Wrong:
-    """Compare the statistics of all steps with what the data files hold, for every column of numbers.
+    """Compare the statistics of all steps with the data files, for every column of numbers.
 
     Args:
-        columns: as ``meta/info.json`` is to describe them.
+        stored: column to its stored statistics.
+        files: the data files.
+        columns: the columns as ``meta/info.json`` should describe them.
     """
     numbers = {name: of["shape"][0] for name, of in columns.items() if of["dtype"] in ("float32", "int64")}
     frames = {name for name, of in columns.items() if of["dtype"] in ("image", "video")}
@@ -75,25 +80,26 @@ def wrong_in_dataset(stored: Mapping[str, Stored], files: Sequence[Path], column
             continue
         for first in range(0, width, ENTRIES):
             entries = slice(first, first + ENTRIES)
-            read = [
-                matrix(pq.ParquetFile(file).read([column], use_threads=False), column)[:, entries] for file in files
-            ]
+            values = np.concatenate([_entries(file, column)[:, entries] for file in files])
             part = {name: value if name == "count" else value[entries] for name, value in stored[column].items()}
-            yield from wrong_numbers(column, part, np.concatenate(read), QUANTILES)
+            yield from wrong_numbers(column, part, values, QUANTILES)
 
 
 def _entries(file: Path, column: str) -> NDArray[Any]:
+    """Read the values (N, D) of a data file's column."""
     return matrix(pq.ParquetFile(file).read([column], use_threads=False), column)
 
 
 def wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[Any]]) -> Wrong:
-    """Compare a camera's statistics over all frames with those of the episodes, which say what they come to.
+    """Compare a camera's statistics over all frames with the statistics of the episodes.
 
-    Mean, deviation and range follow from them. A quantile lies between the least and the largest of the episodes', and
-    where these are not stated, as in version 2.1, within the bounds of Cantelli's inequality.
-    Nothing is compared where one of them is not complete, which is told elsewhere.
+    Mean, deviation and range follow from the episodes. A quantile must be between the least and the largest quantile of
+    the episodes. Where the episodes state none, as in version 2.1, it must be within the bounds of Cantelli's
+    inequality. Nothing is compared if statistics are missing; ``wrong_in_dataset`` reports that.
 
     Args:
+        column: the camera's column.
+        stored: its statistics over all frames.
         episodes: name to the statistics of all episodes, (episodes, 3), of the count (episodes, 1).
     """
     if any(complete(column, stored, (*FIGURES, *QUANTILES), 3)):
@@ -117,47 +123,48 @@ def wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[Any
         if name in episodes:
             least, most = episodes[name].min(axis=0), episodes[name].max(axis=0)
         if not ((levels >= least - SAME) & (levels <= most + SAME)).all():
-            what = f"{name} of {column} is {levels.tolist()} in the statistics"
-            yield what, f"from {least.tolist()} to {most.tolist()}, as follows from those of the episodes"
+            statement = f"{name} of {column} is {levels.tolist()} in the statistics"
+            yield statement, f"from {least.tolist()} to {most.tolist()}, as follows from those of the episodes"
     yield from _disordered(column, stored)
 
 
 def wrong_pixels(column: str, stored: Stored, levels: NDArray[np.int64], quantiles: Sequence[str]) -> Wrong:
-    """Compare a camera's statistics of an episode with how often each level occurs in its frames, (3, 256)."""
+    """Compare a camera's statistics of an episode with the counts of levels in its frames, (3, 256)."""
     wanted = _of_levels(levels)
     values, shares = np.arange(256) / 255, levels.cumsum(axis=1) / levels.sum(axis=1, keepdims=True)
     for name in quantiles:
-        wanted[name] = np.array([values[np.argmax(channel >= int(name[1:]) / 100)] for channel in shares])
+        share = int(name[1:]) / 100
+        wanted[name] = np.array([values[np.argmax(channel >= share)] for channel in shares])
     for name, expected in wanted.items():
         yield from _unlike(f"{name} of {column}", np.ravel(stored[name]), expected)
 
 
 def wrong_sample(column: str, stored: Stored, levels: NDArray[np.int64], steps: int) -> Wrong:
-    """Compare a camera's statistics of an episode with how often each level occurs in some of its frames, (3, 256).
+    """Compare a camera's statistics of an episode with the counts of levels in some of its frames, (3, 256).
 
-    The range holds all levels of the frames. Mean and deviation are as near to those of the frames as the frames of an
-    episode are alike: see ``MEAN_LEVELS`` and ``DEVIATION``.
+    The range must contain all levels of the frames. Mean and deviation must be near those of the frames, within
+    ``MEAN_LEVELS`` and ``DEVIATION``.
     """
     figures = {name: np.ravel(stored[name]) for name in FIGURES}
-    seen = _of_levels(levels)
+    sample = _of_levels(levels)
     if figures["count"].tolist() != [steps]:
         yield f"count of {column} is {figures['count'].tolist()} in the statistics", f"[{steps}]"
-    if (figures["min"] > seen["min"] + SAME).any():
-        yield f"min of {column} is {figures['min'].tolist()} in the statistics", f"{seen['min'].tolist()} or less"
-    if (figures["max"] < seen["max"] - SAME).any():
-        yield f"max of {column} is {figures['max'].tolist()} in the statistics", f"{seen['max'].tolist()} or more"
-    mean, std = seen["mean"], seen["std"]
+    if (figures["min"] > sample["min"] + SAME).any():
+        yield f"min of {column} is {figures['min'].tolist()} in the statistics", f"{sample['min'].tolist()} or less"
+    if (figures["max"] < sample["max"] - SAME).any():
+        yield f"max of {column} is {figures['max'].tolist()} in the statistics", f"{sample['max'].tolist()} or more"
+    mean, std = sample["mean"], sample["std"]
     if not (np.abs(figures["mean"] - mean) <= MEAN_LEVELS / 255).all():
-        what = f"mean of {column} is {figures['mean'].tolist()} in the statistics"
-        yield what, f"{mean.tolist()} within {MEAN_LEVELS:g} of 255 levels"
+        statement = f"mean of {column} is {figures['mean'].tolist()} in the statistics"
+        yield statement, f"{mean.tolist()} within {MEAN_LEVELS:g} of 255 levels"
     if not ((figures["std"] * DEVIATION >= std) & (figures["std"] <= std * DEVIATION)).all():
-        what = f"std of {column} is {figures['std'].tolist()} in the statistics"
-        yield what, f"{std.tolist()} within a factor of {DEVIATION:g}"
+        statement = f"std of {column} is {figures['std'].tolist()} in the statistics"
+        yield statement, f"{std.tolist()} within a factor of {DEVIATION:g}"
     yield from _disordered(column, stored)
 
 
 def _of_levels(levels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-    """Mean, deviation and range in [0, 1] of pixels whose levels occur so often, (3, 256)."""
+    """Compute mean, deviation and range in [0, 1] of pixels from the counts of their levels, (3, 256)."""
     values, pixels = np.arange(256) / 255, levels.sum(axis=1)
     mean = levels @ values / pixels
     return {
@@ -169,14 +176,14 @@ def _of_levels(levels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
 
 
 def _disordered(column: str, stored: Stored) -> Wrong:
-    """Range, quantiles and mean in their order."""
+    """Compare the order of the range and the quantiles."""
     names = [name for name in ("min", *QUANTILES, "max") if name in stored]
     figures = np.array([np.ravel(stored[name]) for name in names])
     if (np.diff(figures, axis=0) < -SAME).any():
         yield f"{', '.join(names)} of {column} are not in order: {figures.tolist()}", "each at least the one before"
 
 
-def _unlike(what: str, found: Any, expected: NDArray[Any]) -> Wrong:
-    stored = np.asarray(found, float)
-    if stored.shape != expected.shape or not np.allclose(stored, expected, rtol=SAME_SHARE, atol=SAME):
-        yield f"{what} is {stored.tolist()} in the statistics", f"{expected.tolist()}"
+def _unlike(what: str, stored: Any, expected: NDArray[Any]) -> Wrong:
+    values = np.asarray(stored, float)
+    if values.shape != expected.shape or not np.allclose(values, expected, rtol=SAME_SHARE, atol=SAME):
+        yield f"{what} is {values.tolist()} in the statistics", f"{expected.tolist()}"

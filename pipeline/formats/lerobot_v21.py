@@ -1,4 +1,4 @@
-"""LeRobotDataset v2.1, for clients whose lerobot is of 2025: a file of data and one of each video for each episode."""
+"""LeRobotDataset v2.1, for clients with a lerobot of 2025: one data file and one file per video for each episode."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,15 +18,15 @@ from pipeline.identity import Step
 from pipeline.types import Extra
 
 EPISODES_OF_A_PIECE = 50
-"""So many episodes are written again, at most, where a call is killed; the files do not depend on it."""
+"""Largest number of episodes that are written again after a call was killed; the files do not depend on it."""
 
 
 class LeRobotV21(Format[LeRobotV21Config]):
-    """Episodes of a set are numbered from 0; what is for validation is a set of its own, as no client reads splits."""
+    """Sets whose episodes are numbered from 0. Validation episodes form sets of their own: no client reads splits."""
 
     name: ClassVar[Step] = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
-    # An episode is found by its id, in ``meta/episodes.jsonl``: the manifest is the same without this format.
+    # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
 
     def __init__(self, data: Path, options: LeRobotV21Config, extras: Sequence[Extra] = ()) -> None:
@@ -39,7 +39,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
     @property
     def stage_record(self) -> Path:
-        # Of one stage with v3.0, as a stage of DVC has files whether or not this format is asked for.
+        # One stage writes v3.0 and v2.1, because a stage of DVC has files whether or not this format is requested.
         return super().stage_record.with_name(f"{LeRobot.name}.json")
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
@@ -84,10 +84,10 @@ class LeRobotV21(Format[LeRobotV21Config]):
         return lerobot_v21_read.read(self.folder, row["episode_id"], self.convention, self.extras)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
-        one = self.keys["action"]
+        actions = self.keys["action"]
         return f"""\
 The repository is laid out as the folder that `finetune/` expects, here `$DATA`; below `lerobot_v21/` lies a dataset in
-the convention `{self.options.convention}` for each folder, with the actions as `{one}`:
+the convention `{self.options.convention}` for each folder, with the actions as `{actions}`:
 
 ```sh
 export DATA=$PWD/{name}

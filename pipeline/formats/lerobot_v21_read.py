@@ -1,4 +1,4 @@
-"""LeRobot v2.1 datasets read back by PyArrow and PyAV; the installed lerobot reads v3.0 alone."""
+"""Reader and checks of LeRobot v2.1 datasets by PyArrow and PyAV; the installed lerobot reads v3.0 alone."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -26,10 +26,10 @@ NAME, VERSION = "lerobot_v21", "v2.1"
 
 
 def open_all(folder: Path) -> None:
-    """Read what every set says of itself.
+    """Read the metadata of every set.
 
     Raises:
-        PipelineError: when that cannot be read.
+        PipelineError: when the metadata cannot be read.
     """
     for root in _sets(folder):
         with readable(root, VERSION):
@@ -39,8 +39,10 @@ def open_all(folder: Path) -> None:
 def check(
     folder: Path, kept: Mapping[str, Row], convention: Convention, extras: tuple[Extra, ...], validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
-    """Compare the sets as a whole with what their files hold: every field of ``meta/info.json``, the tasks, the splits,
-    the files of every episode, the videos' own properties, and the statistics of all columns, computed again.
+    """Compare the metadata of the sets with the content of their files.
+
+    The check covers every field of ``meta/info.json``, the tasks, the splits, the files of every episode, and the
+    videos' own properties. It computes the statistics of all columns again.
 
     Raises:
         PipelineError: when a set cannot be opened.
@@ -59,7 +61,7 @@ def check(
         split_of |= dict.fromkeys(rows, "val" if root.name.endswith("_val") else "train")
     if len(split_of) != len(kept):
         yield "ids", Fault(NAME, None, f"{len(split_of)} episodes", f"{len(kept)}")
-    # One that is missing is told where it is looked for.
+    # Reading the episodes reports missing ones.
     for episode_id in split_of.keys() - kept.keys():
         yield "ids", Fault(NAME, episode_id, "is in the dataset", "kept episodes alone")
     splits, wanted = set(split_of.values()), {"train", "val"} if validation else {"train"}
@@ -69,11 +71,11 @@ def check(
 
 
 def _format(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[Fault]:
-    """Compare what ``meta/`` of a set states with its files and its episodes."""
+    """Compare the statements of a set's ``meta/`` with its files and its episodes."""
     info, rows, _ = _opened(root, _modified_ns(root))
     tasks = _lines(root / "meta" / "tasks.jsonl")
     columns = as_json(described(convention, extras))
-    videos = [key for key, of in columns.items() if of["dtype"] == "video"]
+    videos = [key for key, description in columns.items() if description["dtype"] == "video"]
     indices = [row["episode_index"] for row in rows.values()]
     files = [*map(data_path, indices), *(video_path(index, key) for index in indices for key in videos)]
     wanted = {
@@ -93,27 +95,27 @@ def _format(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> It
     }
     within = f"{root.name}: "
     yield from unlike(NAME, info, wanted, within)
-    there = [file.relative_to(root).as_posix() for file in root.glob("*/chunk-*/**/*") if file.is_file()]
+    existing = [file.relative_to(root).as_posix() for file in root.glob("*/chunk-*/**/*") if file.is_file()]
     stated = [line["episode_index"] for line in _lines(root / "meta" / "episodes_stats.jsonl")]
-    read = {"fields of info.json": sorted(info), "files": sorted(there), "episodes with statistics": stated}
+    read = {"fields of info.json": sorted(info), "files": sorted(existing), "episodes with statistics": stated}
     expected = {"fields of info.json": sorted(wanted), "files": sorted(files), "episodes with statistics": indices}
     yield from unlike(NAME, read, expected, within)
     lines = _lines(root / "meta" / "episodes.jsonl")
     read = {"episode_index": [line.get("episode_index") for line in lines]}
-    read["fields of episodes.jsonl"] = sorted({(*sorted(line),) for line in lines})
+    read["fields of episodes.jsonl"] = sorted({tuple(sorted(line)) for line in lines})
     expected = {"episode_index": [*range(len(rows))]}
     expected["fields of episodes.jsonl"] = [("episode_id", "episode_index", "length", "tasks")]
     yield from unlike(NAME, read, expected, within)
     yield from wrong_tasks(NAME, tasks, [row["tasks"][0] for row in rows.values()])
     if convention.open_is_one:
         yield from wrong_modality(NAME, root, columns, convention)
-    # Those of a set are alike: one of each view is opened, and of the others the frames that are decoded.
+    # The videos of a set are alike: only the first of each view is opened here. Reading episodes decodes frames of all.
     for key in videos:
         yield from wrong_video(NAME, root / video_path(indices[0], key), info["features"][key]["info"])
 
 
 def _wrong_statistics(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[tuple[str, str]]:
-    """Compare ``meta/stats.json`` with all steps, and for frames with the statistics of the episodes."""
+    """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
     yield from wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(extras))
     views = [convention.name(view.lerobot_key) for view in SCHEMA.views.values()]
@@ -124,14 +126,15 @@ def _wrong_statistics(root: Path, convention: Convention, extras: tuple[Extra, .
             for view, name in figures:
                 figures[view, name].append(np.ravel(stats[view][name]))
     for view in views:
-        yield from wrong_frames(view, stored[view], {name: np.array(figures[view, name]) for name in FIGURES})
+        of_episodes = {name: np.array(figures[view, name]) for name in FIGURES}
+        yield from wrong_frames(view, stored[view], of_episodes)
 
 
 def read(folder: Path, episode_id: str, convention: Convention, extras: tuple[Extra, ...]) -> Copy | None:
-    """An episode with these extras, under v3.0's names and with LIBERO's gripper; None when no set has it.
+    """Read an episode with these extras, under v3.0's names and with LIBERO's gripper; ``None`` when no set has it.
 
     Raises:
-        PipelineError: when it cannot be read.
+        PipelineError: when the episode cannot be read.
     """
     for root in _sets(folder):
         with readable(root, VERSION):
@@ -150,27 +153,28 @@ def _copy(
     extras: tuple[Extra, ...],
 ) -> Copy:
     index = row["episode_index"]
-    stored = table = pq.read_table(root / data_path(index))
-    refuse_others(table, row, row["first_step"])
-    instructions = [tasks[task] for task in table["task_index"].to_pylist()]
+    stored = pq.read_table(root / data_path(index))
+    refuse_others(stored, row, row["first_step"])
+    instructions = [tasks[task] for task in stored["task_index"].to_pylist()]
     if row["tasks"] != [instructions[0]]:
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
-    before = {name: ours for ours, name in convention.names.items()}
-    table = table.rename_columns([before.get(name, name) for name in table.column_names])
+    v30_names = {name: v30_name for v30_name, name in convention.names.items()}
+    table = stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
     made = episode(table, row, instructions[0], extras)
     if convention.open_is_one:
-        made = replace(made, action=np.hstack([made.action[:, :-1], 1 - 2 * made.action[:, -1:]]))
+        libero_gripper = 1 - 2 * made.action[:, -1:]
+        made = replace(made, action=np.hstack([made.action[:, :-1], libero_gripper]))
     keys = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
     videos = {view: (root / video_path(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"}
     marks = {name: table[name].to_numpy() for name in MARKS}
     numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
     statistics = Statistics(_statistics(root, index), numbers, keys)
-    shown = decoded(table["timestamp"].to_pylist(), videos)
-    return Copy(NAME, made, instructions, shown, marks, {}, statistics=statistics)
+    frames = decoded(table["timestamp"].to_pylist(), videos)
+    return Copy(NAME, made, instructions, frames, marks, {}, statistics=statistics)
 
 
 def _statistics(root: Path, index: int) -> dict[str, Any]:
-    """Read what ``meta/episodes_stats.jsonl`` states of an episode's columns."""
+    """Read the statistics of an episode's columns in ``meta/episodes_stats.jsonl``."""
     file = root / "meta" / "episodes_stats.jsonl"
     with file.open("rb") as lines:
         lines.seek(_begins(edition(file))[index])
@@ -183,7 +187,7 @@ def _statistics(root: Path, index: int) -> dict[str, Any]:
 
 @lru_cache(maxsize=8)
 def _begins(file: Edition) -> list[int]:
-    """Where the lines of a file begin, in bytes."""
+    """Return the offset of each line of a file, in bytes."""
     with file.path.open("rb") as lines:
         lengths = [len(line) for line in lines]
     return [0, *accumulate(lengths)]
@@ -199,15 +203,19 @@ def _modified_ns(root: Path) -> int:
 
 @lru_cache(maxsize=8)
 def _opened(root: Path, modified_ns: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[int, str]]:
-    """``meta/info.json``, episode id to its line and its provenance, and number to task."""
+    """Read ``meta/info.json``, each episode's line and provenance by its id, and the tasks by their number."""
     info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text())
     rows = _lines(root / "meta" / "episodes.jsonl")
     first_step = 0
     for row in rows:
-        row["first_step"], first_step = first_step, first_step + row["length"]
+        row["first_step"] = first_step
+        first_step += row["length"]
     provenance = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
     tasks = {row["task_index"]: row["task"] for row in _lines(root / "meta" / "tasks.jsonl")}
-    return info, {also[EPISODE_ID]: also | row for row, also in zip(rows, provenance, strict=True)}, tasks
+    by_id = {}
+    for row, labels in zip(rows, provenance, strict=True):
+        by_id[labels[EPISODE_ID]] = labels | row
+    return info, by_id, tasks
 
 
 def _lines(file: Path) -> list[dict[str, Any]]:

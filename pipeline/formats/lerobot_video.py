@@ -1,4 +1,4 @@
-"""The H.264 files of a LeRobot dataset, each with the episodes of one worker."""
+"""Writer of the H.264 files of a LeRobot dataset, each with the episodes of one worker."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -18,12 +18,12 @@ OPTIONS = {
     # Measured on LIBERO frames (benchmarks/video_quality.py): 40 dB to the stored JPEG files in both views at 6.7 kB a
     # frame, a third of theirs, no frame below 37 dB. "superfast" saves a tenth of the bytes for twice the time.
     "preset": "ultrafast",
-    # The quantiser is fixed, 22 and 19 for key frames. A "crf" of 20, which chooses it for each frame, makes files as
-    # large and in the mean as good, but with frames as low as 35 dB, and takes a third more time.
+    # The quantiser is fixed: 22, and 19 for key frames. A "crf" of 20 chooses it for each frame. Its files have equal
+    # size and mean quality, but single frames of 35 dB, and take a third more time.
     "qp": "22",
     # lerobot's own choice: any frame is at most one frame away from a key frame, for random access in training.
     "g": "2",
-    # The first frame of an episode needs nothing of the episode before.
+    # The first frame of an episode does not depend on the episode before.
     "forced-idr": "1",
     # The bytes depend on the number of threads; files are written in parallel already.
     "threads": "1",
@@ -37,17 +37,17 @@ INFO = {
     "video.is_depth_map": False,
     "video.fps": SCHEMA.fps_hz,
     "has_audio": False,
-    # What lerobot 0.6 encodes anew by, where an edit cuts a file; else it uses B-frames, and cannot merge what it made.
-    # It knows no "qp".
+    # lerobot 0.6 encodes with these settings where an edit cuts a file. Without them it uses B-frames and cannot merge
+    # its own files. It does not support "qp".
     "video.g": int(OPTIONS["g"]),
     "video.crf": 20,
     "video.preset": OPTIONS["preset"],
 }
-"""What ``meta/info.json`` says of such files."""
+"""Properties of these files in ``meta/info.json``."""
 
 
 class Video:
-    """A file in the making, frame by frame; whole when the block ends."""
+    """A file that is written frame by frame; it is complete when the block ends."""
 
     def __init__(self, path: Path) -> None:
         self.frames = 0
@@ -65,7 +65,12 @@ class Video:
         self._file.close()
 
     def add(self, pixels: Frame, *, first: bool) -> None:
-        """Append a frame (H, W, 3); ``first`` of an episode."""
+        """Append a frame (H, W, 3).
+
+        Args:
+            pixels: the frame.
+            first: True if it is the first frame of an episode.
+        """
         frame = av.VideoFrame.from_numpy_buffer(planes(pixels), format=INFO["video.pix_fmt"])
         frame.pts, frame.time_base = self.frames, Fraction(1, SCHEMA.fps_hz)
         if first:
@@ -75,5 +80,8 @@ class Video:
 
 
 def planes(pixels: Frame) -> NDArray[np.uint8]:
-    """The planes Y, U and V (3 * H / 2, W) of a frame; in a third of the time of FFmpeg's conversion, at its PSNR."""
+    """Convert a frame to its planes Y, U and V (3 * H / 2, W).
+
+    The conversion takes a third of the time of FFmpeg's, at equal PSNR.
+    """
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2YUV_I420), np.uint8)

@@ -1,11 +1,11 @@
-"""LeRobot v3.0 as its files are published, without lerobot, which only reads and checks them here.
+"""Writer of LeRobot v3.0 files as published, without lerobot, which only reads and checks them here.
 
-A worker writes the files of some episodes in a row: one of data, one of each video, one of ``meta/episodes``. They are
-final, as the number of steps before them is known. Files of the same number hold the same episodes. What is about all
-episodes comes at the end: tasks, splits, exact statistics, and ``meta/provenance.parquet`` with a row for each episode,
-which lerobot passes by.
+A worker writes the files of consecutive episodes: one of data, one of each video, one of ``meta/episodes``. They are
+final, because the number of preceding steps is known. Files of one number hold the same episodes. The files about all
+episodes come at the end: tasks, splits, exact statistics, and ``meta/provenance.parquet`` with a row for each episode,
+which lerobot ignores.
 
-lerobot's own writer appends by writing whole files again, and its statistics are averages of per-episode quantiles
+lerobot's own writer appends by writing whole files again. Its statistics are averages of per-episode quantiles
 (huggingface/lerobot#3804) from a sample of the frames.
 """
 
@@ -29,7 +29,7 @@ from pipeline.types import Episode, Extra
 FILES_OF_A_CHUNK, PLACE = 1000, "chunk-{chunk_index:03d}/file-{file_index:03d}"
 
 DATA, EPISODES = "data.parquet", "episodes.parquet"
-"""In a piece's folder, beside ``<view>.mp4``."""
+"""Files in a piece's folder, in addition to ``<view>.mp4``."""
 
 INDEX = (
     '{"index_columns": ["task"], "column_indexes": [{"name": null, "field_name": null, "pandas_type": "unicode", '
@@ -38,19 +38,19 @@ INDEX = (
     '"task", "pandas_type": "object", "numpy_type": "str", "metadata": null}], "attributes": {}, "creator": '
     '{"library": "pyarrow", "version": "26.0.1"}, "pandas_version": "3.1.1"}'
 )
-"""Has pandas take the texts of the tasks as index, as pandas 3.1.1 says it; what it says depends on its version."""
+"""Metadata by which pandas uses the texts of the tasks as index, fixed here as pandas 3.1.1 writes it."""
 
 
 def file_path(kind: str, number: int, suffix: str) -> str:
-    """Path of a dataset's file below its root; ``kind`` is ``data``, ``meta/episodes`` or ``videos/<key>``."""
+    """Return a file's path below the dataset's root; ``kind`` is ``data``, ``meta/episodes`` or ``videos/<key>``."""
     chunk, file = divmod(number, FILES_OF_A_CHUNK)
     return f"{kind}/{PLACE.format(chunk_index=chunk, file_index=file)}{suffix}"
 
 
 def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, extras: tuple[Extra, ...]) -> None:
-    """Write the files of some episodes into a new folder; one episode at a time is in memory.
+    """Write the files of a piece's episodes into a new folder, with one episode at a time in memory.
 
-    The bytes, videos included, depend on the episodes, their order and the encoder's version alone.
+    The bytes, including those of videos, depend only on the episodes, their order and the encoder's version.
 
     Raises:
         PipelineError: when an episode breaks the schema.
@@ -59,36 +59,42 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, ex
     rows, made = [], []
     with ExitStack() as opened:
         data = opened.enter_context(pq.ParquetWriter(path / DATA, of_episode.schema(convention.columns(extras))))
-        with_videos = convention.frames == "video"
-        videos = {view: opened.enter_context(Video(path / f"{view}.mp4")) for view in SCHEMA.views if with_videos}
+        videos = {}
+        if convention.frames == "video":
+            for view in SCHEMA.views:
+                videos[view] = opened.enter_context(Video(path / f"{view}.mp4"))
         for index, first_step, episode, numbers in of_episode.each(piece, load, convention, extras):
-            shown = {view: of_episode.show(episode, view, videos.get(view)) for view in SCHEMA.views}
+            levels = {view: of_episode.show(episode, view, videos.get(view)) for view in SCHEMA.views}
             columns = of_episode.columns(episode, numbers, convention.frames)
             if convention.language:
                 columns |= of_episode.language(episode, piece.split == "train")
-            # A row group for each episode, so that one is read without the others.
-            data.write_table(pa.table({name: columns[name] for name in data.schema.names}).cast(data.schema))
-            # An episode's statistics are there because lerobot's tools for editing put them together again.
-            figures = of_episode.figures(numbers, shown)
-            stats = {f"stats/{name}/{of}": value for name, one in figures.items() for of, value in listed(one).items()}
-            rows.append(_row(episode, piece, index, first_step, convention.frames) | stats)
-            made.append((of_episode.provenance(episode, index), shown))
+            # Each episode is a row group of its own, so that it can be read alone.
+            table = pa.table({name: columns[name] for name in data.schema.names})
+            data.write_table(table.cast(data.schema))
+            row = _row(episode, piece, index, first_step, convention.frames)
+            # lerobot's tools for editing aggregate the statistics of the episodes.
+            for name, figures in of_episode.figures(numbers, levels).items():
+                row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
+            rows.append(row)
+            made.append((of_episode.provenance(episode, index), levels))
     pq.write_table(pa.Table.from_pylist(rows), path / EPISODES)
     of_episode.summarise(path, made, extras)
 
 
 def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, extras: tuple[Extra, ...]) -> None:
-    """Put the files of all pieces in their places below ``root``, and write what is about all of them."""
+    """Link the files of all pieces to their places below ``root``, and write the files about all episodes."""
     for piece in pieces:
         places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
-        places |= {f"{view}.mp4": (f"videos/{of.lerobot_key}", ".mp4") for view, of in SCHEMA.views.items()}
+        places |= {f"{view}.mp4": (f"videos/{spec.lerobot_key}", ".mp4") for view, spec in SCHEMA.views.items()}
         for name, (kind, suffix) in places.items():
-            if (made := work / piece.path / name).exists():
+            made = work / piece.path / name
+            if made.exists():
                 link(made, root / file_path(kind, piece.number, suffix))
     tasks = of_episode.finish(work, root, pieces, convention, extras)
     # lerobot finds a task by the table's index.
     numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
-    pq.write_table(pa.table(numbered).replace_schema_metadata({"pandas": INDEX}), root / "meta" / "tasks.parquet")
+    table = pa.table(numbered).replace_schema_metadata({"pandas": INDEX})
+    pq.write_table(table, root / "meta" / "tasks.parquet")
     of_episode.write_modality(root, convention)
     splits: dict[str, tuple[int, int]] = {}  # Ranges of episodes, in the order of the pieces.
     for piece in pieces:
@@ -109,7 +115,7 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
 
 
 def _row(episode: Episode, piece: Piece, index: int, first_step: int, frames: Frames) -> dict[str, Any]:
-    """Of ``meta/episodes``: where an episode lies."""
+    """Return an episode's row of ``meta/episodes``, which states its place."""
     chunk, file = divmod(piece.number, FILES_OF_A_CHUNK)
     steps = len(episode)
     row = {

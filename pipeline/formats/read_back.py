@@ -1,4 +1,4 @@
-"""What is found where a dataset is read back: its copies of episodes, its files, and what is off with either."""
+"""Records of a dataset that is read back: its copies of episodes, its files, and the faults of both."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,11 +15,13 @@ from pipeline.types import Episode, Frame
 
 @dataclass(frozen=True)
 class Fault:
-    """Something off.
+    """A difference between a dataset and its expected content.
 
     Attributes:
-        dataset: a format's name, ``manifest``, or ``frames`` for the store that the datasets were made from.
-        episode: its id, or None when it is about the whole dataset.
+        dataset: a format's name, ``manifest``, or ``frames`` for the store behind the datasets.
+        episode: id of the episode, or ``None`` when the fault concerns the whole dataset.
+        what: the statement or content of the dataset.
+        expected: the expected statement or content.
     """
 
     dataset: str
@@ -30,13 +32,13 @@ class Fault:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a dataset states of an episode's columns, and the columns.
+    """Statistics that a dataset states of an episode's columns, and the columns.
 
     Attributes:
-        stored: column to the name of a figure to its values.
-        numbers: column to what it has at each step, (T, D).
+        stored: column to the name of a statistic to its values.
+        numbers: column to its values at each step, (T, D).
         views: view to the column of its frames.
-        quantiles: names of the quantiles that are stated of an episode.
+        quantiles: names of the quantiles that the dataset states of an episode.
     """
 
     stored: Mapping[str, Mapping[str, Any]]
@@ -47,18 +49,19 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Copy:
-    """An episode as a dataset hands it out.
+    """An episode as a dataset returns it.
 
     Attributes:
-        episode: the record that its writer was given, as far as the dataset has it: of whatever shapes and types stand
-            there, with the instruction of the first step, and without frames where they are no image files.
+        dataset: name of the format.
+        episode: the writer's record as far as the dataset stores it. It has the shapes and types of the dataset, the
+            instruction of the first step, and frames only if they are image files.
         instructions: one for each step.
         decoded: (view, step) to the frame, for ``sampled`` steps, where frames are a video.
-        marks: what else stands at each step, by the dataset's own names, each (T,).
-        place: where it lies, by the format's columns of the manifest.
-        said: lerobot's language column, the entries of each step; None where the dataset has none.
-        train: whether it is there to train on.
-        statistics: those of the episode; None where the dataset states none.
+        marks: further columns of each step, by the dataset's own names, each (T,).
+        place: place of the episode, by the format's columns of the manifest.
+        said: lerobot's language column, the entries of each step; ``None`` where the dataset has no such column.
+        train: True if the episode is in the training split.
+        statistics: statistics of the episode; ``None`` where the dataset states none.
     """
 
     dataset: str
@@ -75,10 +78,10 @@ class Copy:
         return len(self.episode)
 
     def frame(self, view: str, step: int) -> Frame:
-        """(H, W, 3) of a sampled step.
+        """Return the frame (H, W, 3) of a sampled step.
 
         Raises:
-            ValueError: when it cannot be decoded.
+            ValueError: when the frame cannot be decoded.
         """
         files = self.episode.frames.get(view)
         return decode(files[step]) if files else self.decoded[view, step]
@@ -86,10 +89,10 @@ class Copy:
 
 @dataclass(frozen=True)
 class Written:
-    """A file as the record of its dataset has it.
+    """A file as the record of its dataset states it.
 
     Attributes:
-        sha256: of what was written.
+        sha256: SHA-256 of the written content.
     """
 
     dataset: str
@@ -97,8 +100,9 @@ class Written:
     sha256: str
 
     def faults(self) -> list[Fault]:
-        """What is off with it, by reading all of it: nothing, or that it is not what was written."""
-        expected = f"what its checksum in {self.dataset}.json is of; move it away, and `{MAKE_AGAIN}` makes it again"
+        """Read the whole file and report if it is unreadable or differs from the written content."""
+        remedy = f"move the file away, and `{MAKE_AGAIN}` writes it again"
+        expected = f"the content with its checksum in {self.dataset}.json; {remedy}"
         try:
             same = checksum(self.file) == self.sha256
         except OSError as error:
@@ -109,28 +113,30 @@ class Written:
 def in_both_splits(
     dataset: str, split_of: Mapping[str, str], kept: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[tuple[str, Fault]]:
-    """Find demonstrations with episodes in two splits: validation would know the actions from training.
+    """Find demonstrations with episodes in two splits: training would contain the actions of validation.
 
-    All that was expanded from one human demonstration counts as that one.
+    Demonstrations that were expanded from one human demonstration count as one.
 
     Args:
+        dataset: name of the format.
         split_of: episode id to its split.
         kept: episode id to its row of the manifest.
     """
     first: dict[tuple[str, str], str] = {}
     for episode_id, split in split_of.items():
-        if (row := kept.get(episode_id)) is None:
-            continue  # Reported as a foreign one.
+        row = kept.get(episode_id)
+        if row is None:
+            continue  # Another check reports it as an unexpected episode.
         task = row["demo_id"].rpartition("/")[0]
         origin = (task, row.get("demo_origin_sha256") or row["demo_id"])
-        other = split_of[first.setdefault(origin, episode_id)]
-        if other != split:
-            what = f"is in {split}, and {first[origin]} of the same demonstration {row['demo_id']} in {other}"
+        first_split = split_of[first.setdefault(origin, episode_id)]
+        if first_split != split:
+            what = f"is in {split}, and {first[origin]} of the same demonstration {row['demo_id']} in {first_split}"
             yield "splits", Fault(dataset, episode_id, what, "one split for all episodes of a demonstration")
 
 
 def unlike(dataset: str, read: Mapping[str, Any], wanted: Mapping[str, Any], within: str = "") -> Iterator[Fault]:
-    """Compare what files state, by the name of the statement, with what they should state."""
+    """Compare the statements of files with the expected statements, both by name."""
     for name, expected in wanted.items():
         if read.get(name) != expected:
             yield Fault(dataset, None, f"{within}{name} is {_short(read.get(name))}", _short(expected))
@@ -142,5 +148,5 @@ def _short(value: object) -> str:
 
 
 def sampled(steps: int) -> list[int]:
-    """The steps whose frames are decoded: the first, the middle and the last."""
+    """Return the steps whose frames are decoded: the first, the middle and the last."""
     return sorted({0, steps // 2, steps - 1})

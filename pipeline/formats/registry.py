@@ -1,4 +1,4 @@
-"""The output formats: one line each."""
+"""Registry of the output formats, one line each."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ FORMATS: tuple[type[Format[Any]], ...] = (
 
 
 def formats_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
-    """The datasets that are asked for, of a run whose folder is ``data`` and whose episodes have these extras."""
+    """List the requested datasets of a run whose folder is ``data`` and whose episodes have these extras."""
     return [kind(data, options.formats[kind.name], extras) for kind in FORMATS if kind.name in options.formats]
 
 
@@ -30,29 +30,35 @@ FAILURES = "failures"
 
 
 def failures_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
-    """The datasets of failures; none where they are not asked for."""
-    return formats_of(data / FAILURES, options.of_failures(), (*extras, "outcome")) if options.failures else []
+    """List the datasets of failures; the list is empty if failures are not requested."""
+    if not options.failures:
+        return []
+    return formats_of(data / FAILURES, options.of_failures(), (*extras, "outcome"))
 
 
 def recorded(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
-    """The datasets of a run, and those of failures as far as there are some: a run may have none."""
+    """List the datasets of a run, and its datasets of failures that have a record: a run may have no failures."""
     failures = failures_of(data, options, extras)
-    return [*formats_of(data, options, extras), *(one for one in failures if one.record_file.exists())]
+    written_failures = [target for target in failures if target.record_file.exists()]
+    return [*formats_of(data, options, extras), *written_failures]
 
 
 def columns() -> list[pa.Field]:
-    """The manifest's columns of all formats."""
+    """List the manifest's columns of all formats."""
     return [column for kind in FORMATS for column in kind.columns]
 
 
 def places(formats: list[Format[Any]]) -> dict[str, dict[str, Any]]:
-    """Episode id to where it lies in each format, by the manifest's columns.
+    """Return the place of each episode in each format.
+
+    Returns:
+        Episode id to the values of the manifest's columns.
 
     Raises:
-        PipelineError: when one of the datasets is not finished.
+        PipelineError: when a dataset is not finished.
     """
     merged: dict[str, dict[str, Any]] = {}
-    for one in formats:
-        for episode_id, place in one.record().places.items():
+    for target in formats:
+        for episode_id, place in target.record().places.items():
             merged.setdefault(episode_id, {}).update(place)
     return merged

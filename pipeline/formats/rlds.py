@@ -1,4 +1,4 @@
-"""RLDS as OpenVLA and OpenVLA-OFT read it: TFDS folders of TFRecord shards, one for each suite, without TensorFlow."""
+"""RLDS for OpenVLA and OpenVLA-OFT: a TFDS folder of TFRecord shards for each suite, without TensorFlow."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil
@@ -17,11 +17,11 @@ from pipeline.identity import Step
 from pipeline.tables import column
 
 SHARD_MB = 400
-"""Of a shard, about, where their number is not said."""
+"""Target shard size in MB if ``shards`` is not set."""
 
 
 class Rlds(Format[RldsConfig]):
-    """Shard k of a set has the k-th slice of its episodes; the ids come shuffled, so neighbours are strangers."""
+    """Sets whose shard k has the k-th slice of the episodes; the ids are shuffled, so neighbours are unrelated."""
 
     name: ClassVar[Step] = "rlds"
     title: ClassVar = "RLDS"
@@ -31,14 +31,14 @@ class Rlds(Format[RldsConfig]):
     )
     keys = (
         {name: name for name in (*SCHEMA.views, *MOTION)}
-        | {f"{view}_{own}": f"{view}_{own}" for view in SCHEMA.views for own in (*MATRICES, *MAPS)}
+        | {f"{view}_{name}": f"{view}_{name}" for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
         | {"provenance": "episode_metadata"}
     )
     clients = ("openvla_oft",)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
-        steps = sum(known.steps for known in episodes.known.values())
+        steps = sum(facts.steps for facts in episodes.known.values())
         shards = self.options.shards or ceil(steps / self._shard_steps())
         for split_name, members in episodes.by_split(self.options.validation).items():
             suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
@@ -50,7 +50,7 @@ class Rlds(Format[RldsConfig]):
         return pieces
 
     def _shard_steps(self) -> int:
-        """So many steps make a shard of ``SHARD_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
+        """Return the number of steps in a shard of ``SHARD_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
         map_kb = sum({"depth": 31.0, "segmentation": 3.0}.get(extra, 0.0) for extra in self.extras)
         return int(1000 * SHARD_MB / (len(SCHEMA.views) * (20.0 + map_kb) + 1.0))
 
@@ -66,11 +66,11 @@ class Rlds(Format[RldsConfig]):
         for folder in dict.fromkeys(path.parent for path in shards):
             lengths = {path: len(ids) for path, ids in shards.items() if path.parent == folder}
             rlds_write.write_metadata(folder, lengths, self.extras)
-        return {
-            episode_id: {"rlds_shard": path.name, "rlds_index": index}
-            for path, ids in shards.items()
-            for index, episode_id in enumerate(ids)
-        }
+        places = {}
+        for path, ids in shards.items():
+            for index, episode_id in enumerate(ids):
+                places[episode_id] = {"rlds_shard": path.name, "rlds_index": index}
+        return places
 
     def open(self) -> None:
         from pipeline.formats import rlds_read
@@ -88,15 +88,14 @@ class Rlds(Format[RldsConfig]):
         return rlds_read.read(self.folder, row, self.extras)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
-        builders = "".join(
-            f"""\
+        builders = ""
+        for dataset in sorted({dataset_of(row) for row in kept}):
+            builders += f"""\
 builder = tfds.builder_from_directory(f"{{os.environ['DATA']}}/rlds/{dataset}/{VERSION}")
 for episode in builder.as_dataset(split="train"):
     for step in episode["steps"]:
         image, action, text = step["observation"]["image"], step["action"], step["language_instruction"]
 """
-            for dataset in sorted({dataset_of(row) for row in kept})
-        )
         return f"""\
 The repository is laid out as the folder that `finetune/` expects, here `$DATA`:
 

@@ -9,27 +9,27 @@ VERSION = "1.0.0"
 
 
 def datasets(root: Path) -> list[Path]:
-    """Version folders of the sets below TFDS's ``data_dir``, OFT's ``data_root_dir``.
+    """List the version folders of the sets below ``root``: TFDS's ``data_dir``, OFT's ``data_root_dir``.
 
     Raises:
-        PipelineError: when there is none.
+        PipelineError: when no set exists.
     """
-    found = sorted(file.parent for file in root.glob("*/*/dataset_info.json"))
-    if not found:
+    folders = sorted(file.parent for file in root.glob("*/*/dataset_info.json"))
+    if not folders:
         raise PipelineError("no RLDS dataset", where=root, expected="NAME/1.0.0/dataset_info.json", remedy=MAKE_AGAIN)
-    return found
+    return folders
 
 
 def shard_path(name: str, split_name: str, shard: int, shards: int) -> str:
-    """Path of a shard below the folder of all sets, as TFDS names it."""
+    """Return the path of a shard below the folder of all sets, as TFDS names it."""
     return f"{name}/{VERSION}/{name}-{split_name}.tfrecord-{shard:05d}-of-{shards:05d}"
 
 
 def split_of(shard: Path) -> str:
-    """The split, ``train`` or ``val``, that a shard belongs to."""
+    """Return the split, ``train`` or ``val``, that a shard belongs to."""
     return shard.name.partition(".")[0].rpartition("-")[2]
 
 
 def dataset_of(row: Row) -> str:
-    """Name of the set that holds a kept episode: what its shard's name begins with."""
+    """Return the name of a kept episode's set, which is the prefix of its shard's name."""
     return str(row["rlds_shard"]).partition("-")[0]

@@ -1,4 +1,4 @@
-"""RLDS sets read back without TensorFlow."""
+"""Reader and checks of RLDS sets without TensorFlow."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -21,17 +21,17 @@ from pipeline.formats.tfrecord import METADATA, OVERHEAD_BYTES, columns, record_
 from pipeline.types import Episode, Extra, Geometry
 
 MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")
-"""Columns that tell steps apart."""
+"""Columns that distinguish steps."""
 
 Place = tuple[Path, int]
-"""Shard, and place in it."""
+"""Shard, and index in the shard."""
 
 
 def open_all(root: Path) -> None:
-    """Have TFDS open every set.
+    """Open every set by TFDS.
 
     Raises:
-        PipelineError: when it does not, or there is none.
+        PipelineError: when TFDS fails, or no set exists.
     """
     for folder in datasets(root):
         _info(folder)
@@ -40,9 +40,11 @@ def open_all(root: Path) -> None:
 def check(
     root: Path, kept: Mapping[str, Row], extras: tuple[Extra, ...], validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
-    """Compare the sets as a whole with what their files hold: the feature tree of this version, every field of
-    ``dataset_info.json`` that readers go by, all shards there and whole, as many episodes as were kept, and no
-    demonstration in two splits.
+    """Compare the metadata of the sets with the content of their files.
+
+    The check covers the feature tree of this version, and every field of ``dataset_info.json`` that readers use. All
+    shards must exist and be complete, and the number of episodes must be that of the kept ones. No demonstration may be
+    in two splits.
     """
     stored = 0
     present = {file.parent.parent.name for file in root.glob("*/*/dataset_info.json")}
@@ -63,19 +65,20 @@ def check(
                 yield "readable", Fault("rlds", None, f"{shard_name} has {counts[shard_name]} records", expected)
         yield from (("format", fault) for fault in _wrong_info(folder, info, counts, extras))
         stored += sum(counts.values())
-    # One that is missing is told where it is looked for.
+    # Reading the episodes reports missing ones.
     if stored > len(kept):
         yield "ids", Fault("rlds", None, f"has {stored} episodes, foreign ones or some twice", f"{len(kept)}")
     split_names = {split_of(file) for file in root.glob("*/*/*.tfrecord-*")}
     wanted = {"train", "val"} if validation else {"train"}
     if split_names != wanted:
         yield "format", Fault("rlds", None, f"the splits are {sorted(split_names)}", f"{sorted(wanted)}")
-    # Each episode is where its row says, as the check ``place`` makes sure.
-    yield from in_both_splits("rlds", {one: split_of(Path(row["rlds_shard"])) for one, row in kept.items()}, kept)
+    # The check ``place`` ensures that each episode is in the shard of its row.
+    splits_of = {episode_id: split_of(Path(row["rlds_shard"])) for episode_id, row in kept.items()}
+    yield from in_both_splits("rlds", splits_of, kept)
 
 
 def _lengths(info: Any) -> dict[str, int]:
-    """Name of each shard to the number of its episodes, as ``dataset_info.json`` has it."""
+    """Return the number of episodes of each shard, by the shard's name, as ``dataset_info.json`` states it."""
     lengths: dict[str, int] = {}
     for split_info in info.splits.values():
         lengths |= dict(zip(split_info.filenames, split_info.shard_lengths, strict=True))
@@ -86,7 +89,10 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tupl
     """Compare ``dataset_info.json`` of a set with its shards.
 
     Args:
-        counts: name of each shard that is whole to the number of its records.
+        folder: version folder of the set.
+        info: TFDS's information about the set.
+        counts: name of each complete shard to the number of its records.
+        extras: extras of the episodes.
     """
     name = folder.parent.name
     bytes_of: dict[str, int] = {}
@@ -95,14 +101,14 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tupl
         stored = (folder / shard).stat().st_size - OVERHEAD_BYTES * count
         bytes_of[split_name] = bytes_of.get(split_name, 0) + stored
     stated = json.loads((folder / "dataset_info.json").read_text())
-    there = sorted(path.name for path in folder.glob("*.tfrecord-*"))
+    existing = sorted(path.name for path in folder.glob("*.tfrecord-*"))
     read = {
         "name": stated.get("name"),
         "version": stated.get("version"),
         "fileFormat": stated.get("fileFormat"),
         "filepathTemplate": sorted({split.get("filepathTemplate") for split in stated.get("splits", [])}),
-        "shards that it does not state": sorted({*there} - _lengths(info).keys()),
-        "shards that are not there": sorted(_lengths(info).keys() - {*there}),
+        "shards that it does not state": sorted({*existing} - _lengths(info).keys()),
+        "shards that are not there": sorted(_lengths(info).keys() - {*existing}),
         "number of bytes": {split.name: split.num_bytes for split in info.splits.values()},
         "description": stated.get("description"),
         "homepage": stated.get("location", {}).get("urls"),
@@ -120,13 +126,13 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tupl
         **texts,
         "homepage": [texts["homepage"]],
     }
-    if len(counts) == len(there):
+    if len(counts) == len(existing):
         wanted["number of bytes"] = bytes_of
     yield from unlike("rlds", read, wanted, f"{name}: ")
 
 
 def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
-    """A kept episode, from the place that the manifest says or, where that is wrong, from wherever it lies.
+    """Read a kept episode from its place in the manifest or, if that is wrong, from any other place.
 
     Raises:
         PipelineError: when its record is damaged, or lacks a feature.
@@ -137,7 +143,8 @@ def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
     try:
         steps = _columns(place)
         if steps is None or _id(steps) != episode_id:
-            place = _places(tuple(map(edition, sorted(root.glob("*/*/*.tfrecord-*"))))).get(episode_id)
+            shards = sorted(root.glob("*/*/*.tfrecord-*"))
+            place = _places(tuple(map(edition, shards))).get(episode_id)
             steps = _columns(place)
         return None if place is None or steps is None else _copy(steps, place, extras)
     except KeyError as error:
@@ -145,8 +152,11 @@ def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
 
 
 def _columns(place: Place | None) -> dict[str, Any] | None:
-    record = None if place is None else record_at(*place)
-    return None if place is None or record is None else columns(record, _info(place[0].parent).features)
+    if place is None:
+        return None
+    shard, index = place
+    record = record_at(shard, index)
+    return None if record is None else columns(record, _info(shard.parent).features)
 
 
 def _id(steps: Mapping[str, Any]) -> str:
@@ -155,14 +165,15 @@ def _id(steps: Mapping[str, Any]) -> str:
 
 @lru_cache(maxsize=1)
 def _places(shards: tuple[Edition, ...]) -> dict[str, Place]:
-    """Episode id to its place, from all records up to the first of a shard that is damaged."""
+    """Find the place of each episode by its id; in each shard, read the records before the first damaged one."""
     places: dict[str, Place] = {}
-    for shard in (one.path for one in shards):
+    for shard_edition in shards:
+        shard = shard_edition.path
         try:
             for index, record in enumerate(records(shard)):
                 places[_id(columns(record, _info(shard.parent).features))] = (shard, index)
         except (PipelineError, KeyError):
-            continue  # Told by ``check``, or by ``read`` of the record.
+            continue  # ``check``, or ``read`` of the record, reports the fault.
     return places
 
 
@@ -178,7 +189,7 @@ def _info(folder: Path) -> Any:
 @lru_cache(maxsize=8)
 def _opened(info_file: Edition) -> Any:
     info = tfds.builder_from_directory(info_file.path.parent).info
-    _lengths(info)  # Raises where the names of the shards do not follow from what is stated.
+    _lengths(info)  # Raises if the names of the shards do not follow from the stated ones.
     return info
 
 

@@ -1,8 +1,8 @@
-"""Shards and metadata of RLDS sets, written without TensorFlow.
+"""Writer of shards and metadata of RLDS sets, without TensorFlow.
 
-Feature names, shapes and dtypes are those of the ``libero_*_no_noops`` sets that OpenVLA published (hub:
-``openvla/modified_libero_rlds``), plus provenance and the cameras' matrices in ``episode_metadata``, and extras in
-``observation``; their loaders ignore both.
+Feature names, shapes and dtypes are those of OpenVLA's ``libero_*_no_noops`` sets (hub:
+``openvla/modified_libero_rlds``). Provenance and the cameras' matrices are added to ``episode_metadata``, extras to
+``observation``; the loaders ignore these additions.
 """
 
 import json
@@ -33,17 +33,19 @@ def write_shard(path: Path, episode_ids: Sequence[str], load: Load, extras: tupl
         for episode_id in episode_ids:
             episode = load(episode_id)
             check(episode, extras)
-            example = _serializer(extras).get_tf_example(features(extras).encode_example(_tree(episode)))
-            # Left to itself, protobuf orders its map anew in every process.
+            encoded = features(extras).encode_example(_tree(episode))
+            example = _serializer(extras).get_tf_example(encoded)
+            # protobuf otherwise orders its map differently in every process.
             file.write(framed(example.SerializeToString(deterministic=True)))
 
 
 def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extra, ...] = ()) -> None:
-    """Write what TFDS reads beside the shards.
+    """Write the files that TFDS reads in addition to the shards.
 
     Args:
         folder: ``<name>/1.0.0``.
-        lengths: each shard of it, in order, to its number of episodes.
+        lengths: each shard of the folder, in order, to its number of episodes.
+        extras: extras of the episodes.
     """
     infos = []
     for split_name in sorted({split_of(shard) for shard in lengths}):
@@ -63,13 +65,13 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
         split_infos=infos,
         version=VERSION,
         filename_template=template,
-        check_data=False,  # the check needs TensorFlow
+        check_data=False,  # The check needs TensorFlow.
         **texts(extras),
     )
 
 
 def texts(extras: tuple[Extra, ...] = ()) -> dict[str, str]:
-    """What ``dataset_info.json`` says to people."""
+    """Return the texts of ``dataset_info.json`` for people."""
     kept, end = ("miss the goal", "failure") if "outcome" in extras else ("solve the task", "success")
     return {
         "description": f"LIBERO demonstrations, perturbed, replayed in simulation and kept when they {kept}. "
@@ -83,7 +85,7 @@ def texts(extras: tuple[Extra, ...] = ()) -> dict[str, str]:
 
 @cache
 def features(extras: tuple[Extra, ...] = ()) -> Any:
-    """The feature tree (``tfds.features.FeaturesDict``)."""
+    """Return the feature tree (``tfds.features.FeaturesDict``)."""
     frame = partial(
         tfds.features.Image,
         shape=SCHEMA.frame.shape,
@@ -93,8 +95,9 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     rotated = f"RGB, before the action, rotated by {SCHEMA.image_rotation_deg} degrees from how MuJoCo renders it"
     observation = {view: frame(doc=f"camera {spec.camera}: {rotated}") for view, spec in SCHEMA.views.items()}
     observation |= {"state": _tensor(SCHEMA.state), "joint_state": _tensor(SCHEMA.joint_state)}
-    for name in (name for name in MAPS if name in extras):
-        observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
+    for name in MAPS:
+        if name in extras:
+            observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
     if "object_poses" in extras:
         observation["object_poses"] = _tensor(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
@@ -142,13 +145,17 @@ def _serializer(extras: tuple[Extra, ...] = ()) -> Any:
 
 
 def _tree(episode: Episode) -> dict[str, Any]:
-    last, success = len(episode) - 1, bool(episode.provenance.get("success", True))
+    last = len(episode) - 1
+    success = bool(episode.provenance.get("success", True))
     columns: dict[str, Sequence[Any] | NDArray[Any]] = {**episode.frames}
     columns |= {"state": episode.state, "joint_state": episode.joint_state}
-    columns |= {} if episode.object_poses is None else {"object_poses": episode.object_poses}
-    columns |= {f"{view}_{name}": files for view, seen in episode.geometry.items() for name, files in seen.maps.items()}
-    steps = [
-        {
+    if episode.object_poses is not None:
+        columns["object_poses"] = episode.object_poses
+    for view, geometry in episode.geometry.items():
+        columns |= {f"{view}_{name}": files for name, files in geometry.maps.items()}
+    steps = []
+    for t in range(len(episode)):
+        step = {
             "observation": {name: values[t] for name, values in columns.items()},
             "action": episode.action[t],
             "discount": 1.0,
@@ -158,9 +165,10 @@ def _tree(episode: Episode) -> dict[str, Any]:
             "is_terminal": success and t == last,
             "language_instruction": episode.instruction,
         }
-        for t in range(len(episode))
-    ]
+        steps.append(step)
     metadata: dict[str, Any] = {"file_path": episode.provenance["demo_source"], **episode.provenance}
-    metadata |= {f"{view}_{name}": getattr(seen, name) for view, seen in episode.geometry.items() for name in MATRICES}
-    metadata |= {"instances": json.dumps(list(episode.instances))} if episode.instances else {}
+    for view, geometry in episode.geometry.items():
+        metadata |= {f"{view}_{name}": getattr(geometry, name) for name in MATRICES}
+    if episode.instances:
+        metadata["instances"] = json.dumps(list(episode.instances))
     return {"steps": steps, "episode_metadata": metadata}

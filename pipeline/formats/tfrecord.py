@@ -15,27 +15,27 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError
 
 METADATA = "episode_metadata/"
-"""What the names of columns with one value for the whole episode begin with."""
+"""Prefix of columns with one value for the whole episode."""
 
 
 OVERHEAD_BYTES = 16
-"""What the framing adds to a record."""
+"""Bytes that the framing adds to a record."""
 
 
 def framed(data: bytes) -> bytes:
-    """One TFRecord: length, its checksum, data, its checksum."""
+    """Return data framed as a TFRecord: length, its checksum, data, its checksum."""
     length = struct.pack("<Q", len(data))
     return b"".join((length, checksum(length), data, checksum(data)))
 
 
 def checksum(data: bytes) -> bytes:
-    """TFRecord's masked CRC-32C (``tensorflow/core/lib/io/record_writer.h``)."""
+    """Compute TFRecord's masked CRC-32C (``tensorflow/core/lib/io/record_writer.h``)."""
     crc = google_crc32c.value(data)
     return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
 
 
 def records(shard: Path) -> Iterator[bytes]:
-    """The records of a TFRecord file: length (8 bytes), its checksum (4), data, its checksum (4).
+    """Read the records of a TFRecord file: length (8 bytes), its checksum (4), data, its checksum (4).
 
     Raises:
         PipelineError: naming the file and the record, when a checksum is wrong.
@@ -45,7 +45,7 @@ def records(shard: Path) -> Iterator[bytes]:
 
 
 def spans(shard: Path) -> Iterator[tuple[int, int]]:
-    """Where the data of each record begins and how long it is, in bytes; the data itself is not read.
+    """Find the offset and the length of each record's data, in bytes, without reading the data.
 
     Raises:
         PipelineError: naming the file and the record, when a length is damaged or the file is cut short.
@@ -53,7 +53,8 @@ def spans(shard: Path) -> Iterator[tuple[int, int]]:
     size, start = shard.stat().st_size, 0
     with shard.open("rb") as file:
         for index, head in enumerate(iter(partial(file.read, 12), b"")):
-            length = struct.unpack("<Q", head[:8])[0] if head[8:] == checksum(head[:8]) else size
+            is_intact = head[8:] == checksum(head[:8])
+            length = struct.unpack("<Q", head[:8])[0] if is_intact else size
             end = start + length + OVERHEAD_BYTES
             if end > size:
                 raise _damaged(shard, index)
@@ -62,10 +63,10 @@ def spans(shard: Path) -> Iterator[tuple[int, int]]:
 
 
 def record_at(shard: Path, index: int) -> bytes | None:
-    """The record at a place, from 0; None where the file has none, or ends or breaks before it.
+    """Read the record at an index, counted from 0; ``None`` where the file ends or is damaged before it.
 
     Raises:
-        PipelineError: when its data is damaged.
+        PipelineError: when the record's data is damaged.
     """
     try:
         span = next(islice(spans(shard), index, None), None)
@@ -90,21 +91,24 @@ def _damaged(shard: Path, index: int) -> PipelineError:
 
 
 def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:
-    """An example's columns by path, such as ``observation/image`` or ``episode_metadata/axis``.
+    """Parse a record into its columns by path, such as ``observation/image`` or ``episode_metadata/axis``.
 
     Args:
         record: a serialised ``tf.train.Example``.
         features: the dataset's feature tree (``tfds.features.FeaturesDict``).
 
     Returns:
-        One entry per step, frames left encoded; one entry in all for ``episode_metadata/``. Text is bytes.
+        Columns with one entry per step, or a single entry for ``episode_metadata/``. Frames stay encoded, text is
+        bytes.
 
     Raises:
         PipelineError: when the record lacks a feature.
     """
     try:
         example = _parser(features).parse_example(record)
-        return dict(_flat(example["steps"])) | dict(_flat(example.get("episode_metadata", {}), METADATA))
+        steps = dict(_flat(example["steps"]))
+        metadata = dict(_flat(example.get("episode_metadata", {}), METADATA))
+        return steps | metadata
     except (LookupError, ValueError, TypeError) as error:
         raise PipelineError(
             f"a record cannot be read by features.json ({type(error).__name__}: {error})",
@@ -123,5 +127,5 @@ def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, NDArra
         if isinstance(value, Mapping):
             yield from _flat(value, f"{path}{name}/")
         else:
-            # An object array keeps bytes whole; numpy's own strings drop final zeros.
+            # An object array keeps all bytes; numpy's own strings drop final zeros.
             yield path + name, np.array([value], object) if isinstance(value, bytes) else np.atleast_1d(value)
