@@ -129,6 +129,7 @@ class BackgroundPerturbation(RenderPerturbation):
         return {covering.sha256 for covering in self.coverings}
 
     def credits(self) -> frozenset[Credit]:
+        """List the textures with their licences."""
         return frozenset(Credit(c.texture, "texture", c.licence, "") for c in self.coverings)
 
 
@@ -167,6 +168,7 @@ class BackgroundAxis(Axis):
         )
 
     def offered(self) -> dict[str, int]:
+        """Count the distinct textures of ``sources``, and the procedural ones."""
         listed = textures.catalogue(self.sources).values()
         return {
             "surfaces": len({texture.sha256 for texture in listed}),
@@ -174,6 +176,11 @@ class BackgroundAxis(Axis):
         }
 
     def _draw_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
+        """Sample the texture of a part.
+
+        Args:
+            own_colours: true if the perturbation shows its textures in their own colours.
+        """
         colour_maps = _offered(self.sources, (*COLOUR_MAPS,))
         data_maps = _offered(self.sources, (*DATA_MAPS,))
         images = _offered(self.sources, (None,))

@@ -323,6 +323,7 @@ Number = TypeVar("Number", bound=float)
 
 
 def _ordered(intervals: tuple[tuple[Number, Number], ...]) -> tuple[tuple[Number, Number], ...]:
+    """Check that there are intervals and that each has ``low <= high``."""
     if not intervals or any(low > high for low, high in intervals):
         raise ValueError(f"expected one or more [low, high] with low <= high, got {[list(i) for i in intervals]}")
     return intervals

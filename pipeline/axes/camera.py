@@ -124,6 +124,7 @@ class CameraPerturbation(RenderPerturbation):
         return np.asarray(np.maximum(np.maximum(sphere, turn), dolly))
 
     def _parameters(self) -> tuple[float, ...]:
+        """Return the values of ``PARAMETERS``."""
         return tuple(getattr(self, name) for name in PARAMETERS)
 
 
@@ -148,6 +149,7 @@ def _embed(parameters: Floats) -> _Cameras:
 
 
 def _angle_deg(cosine: Floats) -> Floats:
+    """Convert cosines into angles in degrees."""
     return np.asarray(np.rad2deg(np.arccos(cosine.clip(-1, 1))))
 
 
@@ -163,6 +165,7 @@ def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
 
 
 def _positive(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """Check that all distances are at least ``NEAREST``."""
     if any(low < NEAREST for low, _ in intervals):
         raise ValueError(f"a distance is a positive multiple of the nominal one, {NEAREST} or more")
     return intervals
@@ -174,6 +177,7 @@ Angles = Intervals[Degrees]
 
 
 def _both_ways(low: float, high: float) -> Angles:
+    """Return the intervals of angles with a size from ``low`` to ``high``, in both directions."""
     return ((-high, -low), (low, high))
 
 
@@ -270,6 +274,7 @@ class CameraAxis(Axis):
 
     @model_validator(mode="after")
     def _some_component(self) -> CameraAxis:
+        """Check that at least one component is left."""
         if not (self.distance or self.spherical or self.orientation):
             raise ValueError("leave at least one of distance, spherical and orientation")
         return self

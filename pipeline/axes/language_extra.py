@@ -2,8 +2,8 @@
 
 Like ``language_goal.py``, this module reads words and parses no grammar. A rewrite may mention a thing that the goal
 does not name (``leave the wine``, ``the rack is reserved``). In the classes of rewrites that call all things by their
-names, it may not do so with the thing's name and an article. A rewrite asks for a thing if the thing stands after a
-verb that moves things, is joined to a thing of the goal, or is followed by its destination.
+names, it may not do so with the thing's name and an article. A rewrite asks for a thing that stands after a verb that
+moves things, is joined to a thing of the goal, or stands before its destination.
 """
 
 import re

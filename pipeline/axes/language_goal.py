@@ -139,6 +139,7 @@ def found(plain: str, meant: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[re
 
 
 def _longest_first(entries: Iterable[str]) -> list[str]:
+    """Sort entries by their length, the longest first."""
     return sorted(entries, key=len, reverse=True)
 
 
@@ -368,6 +369,7 @@ def _sides(goal: TaskGoal, original: Reading) -> list[str]:
 
 
 def _on_shelf(top: bool) -> str:
+    """Return the fault of a rewrite that does not keep a shelf's top, or its inside if ``top`` is false."""
     return "does not say on top of the shelf" if top else "says on top of the shelf, which is another place"
 
 

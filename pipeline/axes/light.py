@@ -1,8 +1,8 @@
 """Light: colour, direction, gloss and shadows of the scene's lamps. Render layer; both views change.
 
-All lamps of the model (three in the kitchen, two in the other arenas) get one change, relative to their values in the
-scene, and keep their places. The head light that MuJoCo fixes to each camera stays too, so no perturbation makes a
-frame black. docs/axes.md states the known and the unknown properties of LIBERO-Plus's light.
+All lamps of the model get one change, relative to their values in the scene, and keep their places. The kitchen has
+three lamps, the other arenas have two. The head light that MuJoCo fixes to each camera stays too, so no perturbation
+makes a frame black. docs/axes.md states the known and the unknown properties of LIBERO-Plus's light.
 """
 
 from __future__ import annotations

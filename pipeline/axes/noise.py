@@ -47,6 +47,7 @@ class NoisePerturbation(PixelPerturbation):
 
     @model_validator(mode="after")
     def _component_is_that_of_effect(self) -> NoisePerturbation:
+        """Check that ``component`` is the effect's component."""
         if self.component != self.effect.component:
             raise ValueError(f"component is {self.component!r}, but the effect's parameters are {self.effect!r}")
         return self

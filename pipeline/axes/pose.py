@@ -50,10 +50,10 @@ REACH_M = 0.82
 """Reach of the hand, pointing down, from its base at the height of a table; the replay shows if it grasps there.
 
 A scripted grasp lifted the goal suite's cream cheese from 0.73 to 0.81 m in 5 of 5 test scenes. LIBERO-Plus puts the
-bowl 0.85 to 1.02 m away. There the grasp lifted it with the hand turned by 90 degrees in 11 of 15 scenes, and with the
-hand as in the demonstrations in none of 10. None of 20 replays put the cream cheese in the bowl there. In 91 test
-scenes the bowl is therefore further away than in any sampled scene. In 73 of them the hand takes it, in 18 it receives
-the cream cheese."""
+bowl 0.85 to 1.02 m away. There the grasp lifted it in 11 of 15 scenes with the hand turned by 90 degrees. With the hand
+as in the demonstrations it lifted the bowl in none of 10. None of 20 replays put the cream cheese in the bowl there. In
+91 test scenes the bowl is therefore further away than in any sampled scene. In 73 of them the hand takes it, in 18 it
+receives the cream cheese."""
 
 APART, CLOSE_M = 0.75, 0.15
 """Share of the distance in LIBERO's file that the centres of two objects' regions keep at least, up to ``CLOSE_M``."""
@@ -280,8 +280,8 @@ def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePertu
     """Sample moves uniform over the disks of a level, again if they break the scene that the task's file defines.
 
     The file gives the middle of each thing's region. At the new places the relation that the instruction names must
-    hold, the hand must reach the objects that it has to grasp, and no two things may come much closer. In the goal
-    suite, things first get the places of LIBERO-Plus, except the bowl, which the hand could not grasp there.
+    hold, and the hand must reach the objects that it has to grasp. No two things may come much closer than before. In
+    the goal suite, things first get the places of LIBERO-Plus, except the bowl, which the hand could not grasp there.
     """
     definition = bddl.read(task.bddl_file)
     carriers, centres_m = definition.carriers, definition.centres_m

@@ -56,9 +56,9 @@ class RobotPerturbation(PhysicsPerturbation):
         """Return the scene with the arm turned and at rest, or with the controller's posture, otherwise unchanged.
 
         Raises:
-            RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot
-                touches a thing that it did not touch before, ``test_posture`` when recorded start and offset happen to
-                add up to a posture of the test set.
+            RefusedError: ``joint_limit``: a joint comes too near its limit.
+                ``robot_in_collision``: the robot touches a thing that it did not touch before.
+                ``test_posture``: recorded start and offset happen to add up to a posture of the test set.
         """
         from pipeline.scenes.compiled import ARM, CompiledScene
 

@@ -78,8 +78,8 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     benchmark perturbs one axis at a time, but each part of a combination must keep its clearance too.
 
     Raises:
-        PipelineError: when an axis applies to none of the tasks, a level has no perturbation that keeps its clearance,
-            or a task of the user's own is a test task.
+        PipelineError: when an axis applies to none of the tasks, or a level has no perturbation that keeps its
+            clearance; also when a task of the user's own is a test task.
     """
     by_task = grouped((demo.task, demo) for demo in demos)
     reject_test_tasks(by_task)
