@@ -107,7 +107,7 @@ def thing_words(scene: tuple[str, ...], hints: bool) -> Mapping[str, tuple[str, 
     for kind in scene:
         thing = words().things.get(kind)
         if thing is None:
-            entries = (kind.replace("_", " "), kind.rpartition("_")[2])
+            entries: tuple[str, ...] = (kind.replace("_", " "), kind.rpartition("_")[2])
         elif hints:
             entries = thing.names + thing.hints
         else:
