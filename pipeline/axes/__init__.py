@@ -45,19 +45,21 @@ class Axes(Frozen):
     language: LanguageAxis | None = None
 
     def drawn(self) -> dict[str, Axis]:
-        """Those that are drawn from, by name."""
+        """Return the configured axes by name."""
         return {name: axis for name, axis in self if axis is not None}
 
 
 AXES: Mapping[str, type[Axis]] = {name: get_args(field.annotation)[0] for name, field in Axes.model_fields.items()}
-"""Every axis by its name, in the order in which they apply."""
+"""Name to class of every axis, in the order in which the axes apply."""
 
 _PLACE = {name: place for place, name in enumerate(AXES)}
 
 
 def _read_by(tag: str, kinds: Sequence[Any]) -> Any:
-    """The type of what is one of several kinds, told apart by a field."""
-    return Annotated[reduce(or_, kinds), Field(discriminator=tag)] if len(kinds) > 1 else kinds[0]
+    """Return the union of ``kinds``, discriminated by the field ``tag``; a single kind stays as it is."""
+    if len(kinds) == 1:
+        return kinds[0]
+    return Annotated[reduce(or_, kinds), Field(discriminator=tag)]
 
 
 _LIST: TypeAdapter[tuple[Perturbation, ...]] = TypeAdapter(
@@ -68,13 +70,14 @@ Kind = TypeVar("Kind", bound=Perturbation)
 
 
 def axes_of(name: str) -> tuple[str, ...]:
-    """The axes that a name such as ``language+camera`` joins, in the order in which they apply.
+    """Split a name such as ``language+camera`` into its axes, in the order in which they apply.
 
     Raises:
-        ValueError: when one of them is no axis, or is named twice.
+        ValueError: when a part names no axis, or names an axis for the second time.
     """
     axes = name.split("+")
-    if unknown := [axis for axis in axes if axis not in AXES]:
+    unknown = [axis for axis in axes if axis not in AXES]
+    if unknown:
         raise ValueError(f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(AXES)}, or some joined by +")
     if len(set(axes)) < len(axes):
         raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
@@ -82,30 +85,33 @@ def axes_of(name: str) -> tuple[str, ...]:
 
 
 def level_of_test(tested: TestTask) -> int:
-    """Strength of a test task, 1 to 5, by the ranges of its axis; 0 if its parameters do not tell."""
+    """Return the strength of a test task, 1 to 5, by the ranges of its axis; 0 if its parameters do not state it."""
     return AXES[tested.axis].level_of_test(tested)
 
 
 def components_of(axis: str) -> tuple[str, ...]:
-    """What can stand in the column ``component`` for an axis."""
-    return tuple(one for kind in AXES[axis].draws for one in get_args(kind.model_fields["component"].annotation))
+    """List the values that the column ``component`` can have for an axis."""
+    components: list[str] = []
+    for kind in AXES[axis].draws:
+        components += get_args(kind.model_fields["component"].annotation)
+    return tuple(components)
 
 
 def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:
-    """Perturbations in the order in which they apply, whatever order they were listed in."""
+    """Sort perturbations into the order in which they apply."""
     return tuple(sorted(perturbations, key=lambda p: _PLACE[p.axis]))
 
 
 def to_json(perturbations: Iterable[Perturbation]) -> str:
-    """Canonical JSON of a set of perturbations: the same whatever order they were listed in."""
+    """Write perturbations as canonical JSON, which does not depend on the order of ``perturbations``."""
     return f"[{','.join(p.model_dump_json() for p in in_order(perturbations))}]"
 
 
 def from_json(text: str) -> tuple[Perturbation, ...]:
-    """Read perturbations back, in the order in which they apply.
+    """Read perturbations from JSON, in the order in which they apply.
 
     Raises:
-        PipelineError: when they were recorded by a version of this project with other axes or parameters.
+        PipelineError: when a version of this project with other axes or parameters recorded them.
     """
     try:
         return _LIST.validate_json(text)
@@ -119,5 +125,5 @@ def from_json(text: str) -> tuple[Perturbation, ...]:
 
 
 def of_layer(perturbations: Iterable[Perturbation], layer: type[Kind]) -> tuple[Kind, ...]:
-    """Those that act on one layer, named by its class."""
+    """Return the perturbations that act on one layer, given by the layer's class."""
     return tuple(p for p in perturbations if isinstance(p, layer))

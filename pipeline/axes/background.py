@@ -1,9 +1,9 @@
-"""Background: what the room and the working surface are made of. Render layer; both views change.
+"""Background: materials of the room and the working surface. Render layer; both views change.
 
-The new surface is written into the texture that is there, resampled to its size, so that geometry, reflections and
-the way it is laid over a table or a wall stay LIBERO's. Half of the draws show the new surfaces in colours of their
-own, as LIBERO-Plus's tests do. The other half goes by level: 1 keeps the average colour of what is replaced and changes
-the pattern, 5 shows the new one's own.
+The new surface is resampled to the size of the scene's texture and written into it. Geometry, reflections and the
+mapping onto a table or a wall stay LIBERO's. Half of the perturbations show the new surfaces in their own colours, as
+LIBERO-Plus's tests do. In the other half the level decides: level 1 changes the pattern and keeps the average colour of
+the replaced texture, level 5 shows the new texture's own average colour.
 """
 
 from __future__ import annotations
@@ -35,31 +35,33 @@ Part = Literal["wall", "floor", "cupboard", "surface"]
 MATERIALS: dict[Part, dict[str, int]] = {
     "wall": {"walls_mat": 1},
     "floor": {"floorplane": 1},
-    # What closes the kitchen's view where the other arenas show a wall.
+    # Closes the kitchen's view, as the wall does in the other arenas.
     "cupboard": {"kitchen_background": 1},
-    # Tabletop and kitchen, living room, study; where there is no table, the floor is worked on.
+    # Tabletop and kitchen, living room, study; without a table, the floor is the working surface.
     "surface": {"table_texture": 1, "living_room_table": 2, "desk": 4, "floorplane": 1},
 }
-"""The materials of LIBERO's five arenas (`scenes/*_base_style.xml`) that make up each part: the first that is shown.
-With each, how often a texture is repeated across the material's own, as the top of a modelled table is but a small
-piece of its unfolded skin."""
+"""Candidate materials of each part in LIBERO's five arenas (`scenes/*_base_style.xml`); the first shown one is used.
+
+The number says how often a new texture is repeated across the material's own texture. The top of a modelled table is
+only a small piece of its unfolded skin."""
 
 PARTS: dict[Component, tuple[Part, ...]] = {"theme": ("wall", "floor", "cupboard", "surface"), "surface": ("surface",)}
-"""What a draw names a texture for. Every theme test of LIBERO-Plus names one for a wall and one to work on."""
+"""Parts that a perturbation names a texture for. Every theme test of LIBERO-Plus names one for a wall and one for the
+working surface."""
 
 _DARKEST, _BRIGHTEST = 40.0, 205.0
-"""Grey levels that the average of a surface is kept within, so that no light makes it a black or a white area."""
+"""Lowest and highest average grey level of a surface. Within them no light makes it a black or a white area."""
 
 
 class Covering(Frozen):
-    """A texture on one part of the scene.
+    """Texture on one part of the scene.
 
     Attributes:
-        part: where; a part that the scene does not have is left out. Where the floor is worked on, it is the surface.
+        part: covered part; a part that the scene does not have is left out. A floor that is worked on is the surface.
         texture: name in the sources of :mod:`pipeline.catalogue.textures`.
-        licence: as the texture's source states it.
-        sha256: of the texture.
-        quarter_turns: how often it is turned by 90 degrees, counter-clockwise.
+        licence: licence that the texture's source states.
+        sha256: hash of the texture.
+        quarter_turns: number of counter-clockwise turns by 90 degrees.
     """
 
     part: Part
@@ -73,8 +75,8 @@ class BackgroundPerturbation(RenderPerturbation):
     """New walls, floor and working surface, or a new working surface alone.
 
     Attributes:
-        coverings: which texture goes where.
-        colour_scale: how far the average colour goes from that of the replaced texture (0) to the new one's own (1).
+        coverings: textures and the parts that they cover.
+        colour_scale: position of the average colour between the replaced texture's (0) and the new texture's own (1).
     """
 
     axis: Literal["background"] = "background"
@@ -90,34 +92,44 @@ class BackgroundPerturbation(RenderPerturbation):
         """Write the coverings into the model's textures.
 
         Raises:
-            PipelineError: when a texture is not there any more, or nothing in the scene is known by its material.
+            PipelineError: when a texture no longer exists, or the scene has none of the parts' materials.
         """
-        # By texture, as two parts may be one: the last then stands for both.
-        skins = ((covering, skin_of(model, covering.part)) for covering in self.coverings)
-        shown = {skin.texture: (covering, skin) for covering, skin in skins if skin}
-        if not shown:
+        # Two parts may share one texture: the last covering then counts for both.
+        covered: dict[int, tuple[Covering, Skin]] = {}
+        for covering in self.coverings:
+            skin = skin_of(model, covering.part)
+            if skin:
+                covered[skin.texture] = (covering, skin)
+        if not covered:
+            materials: set[str] = set()
+            materials.update(*MATERIALS.values())
             raise PipelineError(
                 f"the scene shows no {' or '.join(c.part for c in self.coverings)}",
                 where="model",
-                expected=f"one of the materials {sorted({name for names in MATERIALS.values() for name in names})}",
+                expected=f"one of the materials {sorted(materials)}",
                 remedy="use a scene of LIBERO's arenas",
             )
-        for covering, skin in shown.values():
+        for covering, skin in covered.values():
             image = np.rot90(textures.pixels(covering.texture, covering.sha256), covering.quarter_turns)
             _cover(model, skin, image, self.colour_scale)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """The same to all test tasks: whether any shows one of the images, whatever it shows it on."""
-        shown = _images_of(test)
-        known = (textures.normalise(c.texture) in shown or c.sha256 in textures.test_images() for c in self.coverings)
-        return np.full(len(test.of("background")), 0.0 if any(known) else 1.0)
+        """Return one distance for all test tasks: 0 if any of them shows one of the images, on any part, else 1."""
+        is_tested = any(_is_tested(covering, test) for covering in self.coverings)
+        return np.full(len(test.of("background")), 0.0 if is_tested else 1.0)
 
     def apart(self, others: Sequence[BackgroundPerturbation]) -> Floats:
-        """0 where both show one of the images, else 1."""
-        own = {covering.sha256 for covering in self.coverings}
-        return np.array([float(own.isdisjoint(c.sha256 for c in other.coverings)) for other in others])
+        """Return 0 for perturbations that share an image with this one, 1 for the others (N,)."""
+        images = self._images
+        return np.array([float(images.isdisjoint(perturbation._images)) for perturbation in others])
+
+    @property
+    def _images(self) -> set[str]:
+        """Hashes of the textures."""
+        return {covering.sha256 for covering in self.coverings}
 
     def credits(self) -> frozenset[Credit]:
+        """List the textures with their licences."""
         return frozenset(Credit(c.texture, "texture", c.licence, "") for c in self.coverings)
 
 
@@ -156,14 +168,22 @@ class BackgroundAxis(Axis):
         )
 
     def offered(self) -> dict[str, int]:
-        found = textures.catalogue(self.sources).values()
+        """Count the distinct textures of ``sources``, and the procedural ones."""
+        listed = textures.catalogue(self.sources).values()
         return {
-            "surfaces": len({texture.sha256 for texture in found}),
-            "procedural": sum(texture.source == "procedural" for texture in found),
+            "surfaces": len({texture.sha256 for texture in listed}),
+            "procedural": sum(texture.source == "procedural" for texture in listed),
         }
 
     def _draw_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
-        colour_maps, data_maps, images = (_offered(self.sources, (*kind,)) for kind in (COLOUR_MAPS, DATA_MAPS, [None]))
+        """Sample the texture of a part.
+
+        Args:
+            own_colours: true if the perturbation shows its textures in their own colours.
+        """
+        colour_maps = _offered(self.sources, (*COLOUR_MAPS,))
+        data_maps = _offered(self.sources, (*DATA_MAPS,))
+        images = _offered(self.sources, (None,))
         if part == "surface" and own_colours and data_maps and rng.random() < self.map_share:
             texture = pick(rng, data_maps)
         elif images and (rng.random() < self.image_share or not colour_maps):
@@ -171,67 +191,84 @@ class BackgroundAxis(Axis):
         else:
             texture = pick(rng, colour_maps)
         keep(texture)
-        shown = {"texture": texture.name, "licence": texture.licence, "sha256": texture.sha256}
-        return Covering(part=part, **shown, quarter_turns=int(rng.integers(4)))
+        return Covering(
+            part=part,
+            texture=texture.name,
+            licence=texture.licence,
+            sha256=texture.sha256,
+            quarter_turns=int(rng.integers(4)),
+        )
 
 
 @cache
 def _offered(sources: tuple[Source, ...], families: tuple[str | None, ...]) -> list[Texture]:
-    """The textures of some families, all images being of the family None."""
+    """List the textures of some families; images have the family ``None``."""
     return [texture for texture in textures.catalogue(sources).values() if texture.family in families]
 
 
 @cache
 def _images_of(test: TestSet) -> frozenset[str]:
-    """The images that test tasks show, by normalised name."""
-    files = (other.parameters.get(part) for other in test.of("background") for part in ("surface", "wall"))
-    return frozenset(textures.normalise(file) for file in files if isinstance(file, str))
+    """Return the normalised names of the images that test tasks show."""
+    names: set[str] = set()
+    for tested in test.of("background"):
+        for part in ("surface", "wall"):
+            file = tested.parameters.get(part)
+            if isinstance(file, str):
+                names.add(textures.normalise(file))
+    return frozenset(names)
+
+
+def _is_tested(covering: Covering, test: TestSet) -> bool:
+    """Return whether a test task shows the covering's image, by its name or its bytes."""
+    return textures.normalise(covering.texture) in _images_of(test) or covering.sha256 in textures.test_images()
 
 
 class Skin(NamedTuple):
-    """A texture of a model and how often a covering is repeated across it."""
+    """Texture of a model and the number of times that a covering is repeated across it."""
 
     texture: int
     repeats: int
 
 
 def skin_of(model: mujoco.MjModel, part: Part) -> Skin | None:
-    """What makes up a part of the scene; None where the scene has no such part."""
+    """Return the texture that a part of the scene shows, or ``None`` if the scene has no such part."""
     for name, repeats in MATERIALS[part].items():
         try:
             material = model.material(name)
         except KeyError:
             continue
-        # A material lists a texture for each of ten roles, -1 for none; LIBERO's have one, the colour.
+        # A material lists a texture for each of ten roles, or -1. LIBERO's materials have one texture, the colour.
         if material.texid.max() >= 0 and (model.geom_matid == material.id).any():
             return Skin(int(material.texid.max()), repeats)
     return None
 
 
 def _cover(model: mujoco.MjModel, skin: Skin, image: Frame, colour_scale: float) -> None:
-    """Put ``image`` (H, W, 3) in the place of a texture of the model."""
+    """Write ``image`` (H, W, 3) over a texture of the model."""
     import cv2  # takes long, and every process of a run imports the axes
 
-    height, width, channels = (int(n[skin.texture]) for n in (model.tex_height, model.tex_width, model.tex_nchannel))
+    height, width = int(model.tex_height[skin.texture]), int(model.tex_width[skin.texture])
+    channels = int(model.tex_nchannel[skin.texture])
     start = int(model.tex_adr[skin.texture])
-    there = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+    texture = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
     size = (width // skin.repeats, height // skin.repeats)
     interpolation = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
     piece = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
-    own, former = _mean(piece).clip(1), _mean(there)
-    wanted = former + colour_scale * (own - former)
-    wanted *= np.clip(wanted.mean(), _DARKEST, _BRIGHTEST) / wanted.mean()
-    changed = _recoloured(own, wanted, piece.max(axis=(0, 1)))
-    piece = np.asarray(cv2.LUT(piece, np.rint(changed).clip(0, 255).astype(np.uint8)[None]), np.uint8)
+    own_mean, former_mean = _mean(piece).clip(1), _mean(texture)
+    wanted_mean = former_mean + colour_scale * (own_mean - former_mean)
+    wanted_mean *= np.clip(wanted_mean.mean(), _DARKEST, _BRIGHTEST) / wanted_mean.mean()
+    changed = _recoloured(own_mean, wanted_mean, piece.max(axis=(0, 1)))
+    table = np.rint(changed).clip(0, 255).astype(np.uint8)[None]
+    piece = np.asarray(cv2.LUT(piece, table), np.uint8)
     for top, left in product(range(0, height, size[1]), range(0, width, size[0])):
-        there[top : top + size[1], left : left + size[0], :3] = piece[: height - top, : width - left]
+        texture[top : top + size[1], left : left + size[0], :3] = piece[: height - top, : width - left]
 
 
 def _recoloured(own: Floats, wanted: Floats, brightest: NDArray[np.uint8]) -> Floats:
-    """(256, 3) what each grey level of each channel becomes, so that its mean goes from ``own`` to ``wanted``.
+    """Return the new value (256, 3) of each grey level and channel that changes the mean from ``own`` to ``wanted``.
 
-    Darker by a factor. Lighter by a shift; where that would take the brightest value beyond white, the contrast falls
-    until it is white. So the pattern is cut off at neither end.
+    A factor darkens. A shift lightens; if it would take the brightest value beyond white, the contrast falls until
+    this value is white. The pattern is therefore cut off at neither end.
     """
     levels = np.arange(256.0)[:, None]
     contrast = np.clip((255.0 - wanted) / np.maximum(brightest - own, 1e-9), 0.0, 1.0)
@@ -239,7 +276,7 @@ def _recoloured(own: Floats, wanted: Floats, brightest: NDArray[np.uint8]) -> Fl
 
 
 def _mean(image: Frame) -> Floats:
-    """(3,) over the pixels of an image (H, W, 3 or more)."""
+    """Average the first three channels (3,) over the pixels of an image (H, W, 3 or more)."""
     import cv2
 
     sums: Floats = np.asarray(cv2.sumElems(image), float)[:3]

@@ -1,10 +1,10 @@
-"""What every axis of perturbation has in common.
+"""Base classes of all axes of perturbation.
 
-An axis is a pair of small frozen models in one file. What is constant about it are their class attributes:
+An axis is a pair of small frozen models in one file. Their class attributes hold the constants of the axis:
 
-* ``XAxis`` is the axis as configured, its ranges, and draws: ``sample(rng, task, place) -> XPerturbation``.
-* ``XPerturbation`` is one draw with every parameter, and acts: ``apply(...)`` on what its layer touches (text: the
-  instruction; pixels: a clean frame; render: the MuJoCo model; physics: the scene, and what it holds for the rollout).
+* ``XAxis`` holds the configured ranges and samples from them: ``sample(rng, task, place) -> XPerturbation``.
+* ``XPerturbation`` is one sampled change with every parameter. Its ``apply(...)`` changes the object of its layer
+  (text: the instruction; pixels: a clean frame; render: the MuJoCo model; physics: the scene and its rollout settings).
 
 ``pipeline.axes.Axes`` is the registry, with one line for each axis.
 """
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Layer(IntEnum):
-    """The cheapest thing that has to be made again when an axis changes; lower is cheaper."""
+    """Cheapest output that must be generated again when an axis changes; lower is cheaper."""
 
     TEXT, PIXELS, RENDER, PHYSICS = range(4)
 
@@ -40,16 +40,20 @@ LEVELS: tuple[Level, ...] = get_args(Level)
 
 
 class Nearest(NamedTuple):
-    """The distance to the nearest of the benchmark's test tasks, in the axis's own measure, and how many were compared;
-    infinite where there is none."""
+    """Distance to the nearest of the benchmark's test tasks, and the number of test tasks that were compared.
+
+    The distance is in the axis's own measure. It is infinite if no test task was compared.
+    """
 
     distance: float
     compared: int
 
 
 class Credit(NamedTuple):
-    """A ``texture`` or an ``object`` of others' that a perturbation shows; ``attribution`` tells who made it and what
-    was changed, where that is more than the licence says."""
+    """Third-party ``texture`` or ``object`` that a perturbation shows.
+
+    ``attribution`` names the author and the changes, as far as the licence does not state them.
+    """
 
     name: str
     kind: str
@@ -58,19 +62,19 @@ class Credit(NamedTuple):
 
 
 class Perturbation(Frozen):
-    """One draw: a change on one axis, with all of its parameters; JSON in and out through pydantic.
+    """One sampled change on one axis, with all of its parameters; pydantic reads and writes it as JSON.
 
     Attributes:
         axis: name of the axis, the discriminator when a perturbation is read back.
-        component: which of the axis's components was drawn.
+        component: the sampled component of the axis.
         level: strength, 1 to 5, by the ranges that the axis states.
-        layer: what has to be made again.
-        views: those of ``schemas/episode.json`` whose frames this can change; empty for text.
-        measure: what the distance to a test task is.
-        unit: of that distance; None where it tells only same from other, not near from far.
-        clearance: the least distance to any test task; a draw that comes closer is drawn anew.
-        same: what two changes must have in common to be compared, the LIBERO task or the scene that it begins in; None
-            where any two can be.
+        layer: output that must be generated again.
+        views: views of ``schemas/episode.json`` whose frames the change can affect; empty for text.
+        measure: definition of the distance to a test task.
+        unit: unit of this distance; ``None`` if the distance is only 0 for equal changes and positive for others.
+        clearance: least distance to any test task; a perturbation that comes closer is sampled again.
+        same: the property that two changes must share to be compared: the LIBERO task or its initial scene. ``None``
+            if all changes can be compared.
     """
 
     axis: str
@@ -85,9 +89,9 @@ class Perturbation(Frozen):
     same: ClassVar[Same | None] = None
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """The distance to each of the axis's test tasks (N,), in their order, for an episode of ``task``.
+        """Return the distances (N,) to the axis's test tasks, in their order, for an episode of ``task``.
 
-        NaN where there is nothing to compare, such as the wordings of another task.
+        A distance is NaN if the two cannot be compared, such as wordings of different tasks.
         """
         distances = np.full(len(test.of(self.axis)), np.nan)
         if self.same:
@@ -95,53 +99,56 @@ class Perturbation(Frozen):
         return distances
 
     def distances_on(self, test: TestSet, task: Task) -> Sequence[float] | Floats:
-        """Those of ``distances`` to the test tasks that have the ``same`` in common with ``task``."""
+        """Return the ``distances`` to the test tasks that share the property ``same`` with ``task``."""
         raise NotImplementedError
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """The distance to the nearest of the test tasks that this could coincide with, for an episode of ``task``."""
+        """Return the distance to the nearest comparable test task, for an episode of ``task``."""
         distances = self.distances(test, task)
         compared = distances[~np.isnan(distances)]
         return Nearest(float(compared.min(initial=np.inf)), len(compared))
 
     def after(self, earlier: Sequence[Perturbation]) -> Self:
-        """The same change to a demonstration that an expansion made by ``earlier`` changes.
+        """Return this change for a demonstration that an expansion generated with the changes ``earlier``.
 
-        Distances count from LIBERO's own scene, so a change of the same thing has to add what was changed before.
+        Distances count from LIBERO's own scene. A second change of one thing therefore includes the earlier one.
         """
         return self
 
     def in_scene(self, task: Task) -> Self:
-        """The same change, with things named alike in all tasks that begin in the scene of ``task``."""
+        """Return this change with the names that things have in all tasks with the initial scene of ``task``."""
         return self
 
     def apart(self, others: Sequence[Self]) -> Floats:
-        """The distance to each of N draws of this class (N,), as ``distances`` measures it; NaN where there is nothing
-        to compare. At least one, all of the ``same`` task or scene, and ``in_scene`` if their tasks differ.
+        """Return the distances (N,) to N perturbations of this class, in the measure of ``distances``.
 
-        By default 0 to a draw that is equal, else 1.
+        A distance is NaN if the two cannot be compared. By default it is 0 to an equal perturbation, else 1.
+
+        Args:
+            others: at least one perturbation, all for the ``same`` task or scene; results of ``in_scene`` if their
+                tasks differ.
         """
-        return np.array([float(self != other) for other in others])
+        return np.array([float(self != perturbation) for perturbation in others])
 
     def named_in(self, instruction: str) -> bool:
-        """Whether an instruction that the same episode is prompted with has a word for what this adds.
+        """Return whether the episode's ``instruction`` has a word for an object that this perturbation adds.
 
-        Such a perturbation is sampled again, as the instruction would no longer mean one thing only.
+        Such a perturbation is sampled again, because it would make the instruction ambiguous.
         """
         return False
 
     def credits(self) -> frozenset[Credit]:
-        """What this shows that has a licence of its own."""
+        """List the shown textures and objects that have a licence of their own."""
         return frozenset()
 
 
 class Axis(Frozen):
-    """The ranges that an axis draws from.
+    """Ranges that an axis samples from.
 
     Attributes:
-        draws: the perturbations that it draws; several are told apart by their ``component``.
-        not_held_out: why evaluations have no draws of this axis that plans leave alone; empty where they have.
-        levels: the strengths to draw, each as often as the others.
+        draws: classes of the perturbations that it samples; the field ``component`` discriminates between them.
+        not_held_out: reason why evaluations have no held-out perturbations of this axis; empty if they have some.
+        levels: strengths to sample, each with equal probability.
     """
 
     draws: ClassVar[tuple[type[Perturbation], ...]]
@@ -150,75 +157,86 @@ class Axis(Frozen):
     levels: Annotated[tuple[Level, ...], Field(min_length=1)] = LEVELS
 
     def applies(self, task: Task) -> bool:
-        """Whether the axis can change anything that ``task`` has; its episodes are spread over the tasks that it can.
+        """Return whether the axis can change ``task``; its episodes are spread over all tasks that it can change.
 
-        What cannot be known before the scene is built is refused when the perturbation is applied.
+        Obstacles that show only once the scene is built reject the perturbation when it is applied.
         """
         return True
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> Perturbation:
-        """One draw for a task that the axis applies to; what is random comes from ``rng`` alone.
+        """Sample one perturbation of a task that the axis applies to, with randomness from ``rng`` alone.
 
-        ``place`` is that of an entry in ``entries``, for axes that take the entries of a list; others ignore it.
+        Args:
+            place: index into ``entries``, for axes that take the entries of a list; other axes ignore it.
         """
         raise NotImplementedError
 
     def entries(self, task: Task) -> Sequence[str]:
-        """The list that the axis takes its perturbations of a task from; empty where it samples them from ranges."""
+        """List the entries that the axis takes its perturbations of a task from; empty if it samples from ranges."""
         return ()
 
     def refuse_tested(self, test: TestSet, task: Task) -> None:
-        """Refuse a level of which no draw keeps clear of the test tasks, where the ranges tell.
+        """Reject levels without any perturbation that keeps its clearance, as far as the ranges show this.
 
-        Others would fill its place in a plan, and nothing would say so.
+        Otherwise, perturbations of other levels would silently take their place in a plan.
 
         Raises:
             PipelineError: naming component and level.
         """
 
     def draw_level(self, rng: np.random.Generator) -> Level:
+        """Sample one of ``levels`` with equal probability."""
         return pick(rng, self.levels)
 
     def beside(self, axes: Collection[str]) -> Axis:
-        """The axis where episodes are perturbed on these axes together; ValueError where nothing is left to draw."""
+        """Return the axis restricted for episodes that are perturbed on all of ``axes`` together.
+
+        Raises:
+            ValueError: when nothing is left to sample.
+        """
         return self
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
-        """Strength of one of the axis's test tasks, 1 to 5, by the axis's own ranges; 0 if its parameters do not tell.
+        """Return the strength of a test task of the axis, 1 to 5, by the axis's own ranges.
 
-        The benchmark's own ``difficulty_level`` is another thing: how many of four models fail.
+        Return 0 if the parameters do not state it. The benchmark's ``difficulty_level`` differs: it is the number of
+        models, of four, that fail.
         """
         return 0
 
     @classmethod
     def held_out(cls) -> Axis:
-        """The ranges of held-out perturbations: the default ones, from which a key of their own keeps draws apart."""
+        """Return the ranges of held-out perturbations: the default ranges, sampled under keys that no plan has."""
         return cls()
 
     def offered(self) -> dict[str, int]:
-        """How many different things of others' there are to draw from, by kind; what is not installed is fetched."""
+        """Count the distinct third-party things to sample from, by kind; missing sources are fetched."""
         return {}
 
 
 class TextPerturbation(Perturbation):
-    """Changes the instruction."""
+    """Change of the instruction."""
 
     layer: ClassVar[Layer] = Layer.TEXT
     views: ClassVar[frozenset[str]] = frozenset()
 
     def apply(self, instruction: str) -> str:
-        """The instruction to prompt with in place of ``instruction``."""
+        """Return the instruction that replaces ``instruction`` in the prompt."""
         raise NotImplementedError
 
 
 class PixelPerturbation(Perturbation):
-    """Changes clean frames."""
+    """Change of clean frames."""
 
     layer: ClassVar[Layer] = Layer.PIXELS
 
     def apply(self, frame: Frame, frame_index: int) -> Frame:
-        """A changed copy of a frame (H, W, 3), in the simulator's raw orientation, at its place in the episode."""
+        """Return a changed copy of a frame (H, W, 3), in the simulator's raw orientation.
+
+        Args:
+            frame_index: index of the frame in its episode.
+        """
         raise NotImplementedError
 
 
@@ -230,19 +248,19 @@ LIGHT_FIELDS = (
     *("mat_emission", "mat_reflectance", "mat_shininess", "mat_specular"),
 )
 FIELDS = (*CAMERA_FIELDS, *OPACITY_FIELDS, *LIGHT_FIELDS, "tex_data")
-"""Arrays of MuJoCo's model that the render layer can change: each is compared with MuJoCo's own rendering by the tests.
+"""Arrays of MuJoCo's model that the render layer can change; the tests compare each with MuJoCo's own rendering.
 
-What a scene is made of, such as ``geom_size`` or ``mesh_vert``, is kept from one picture to the next."""
+The geometry of a scene, such as ``geom_size`` or ``mesh_vert``, is kept from one picture to the next."""
 
 
 class RenderPerturbation(Perturbation):
-    """Changes what a scene looks like and nothing that moves in it.
+    """Change of a scene's appearance that leaves all motion as it is.
 
     Attributes:
-        fields: the arrays of the model that ``apply`` may write, of ``FIELDS``; they are put back afterwards.
-        paints: whether it writes textures and nothing else.
-        sees_otherwise: whether it sees other surfaces: from another place, through another lens, or through what was
-            opaque.
+        fields: arrays of the model that ``apply`` may write, a subset of ``FIELDS``; they are restored afterwards.
+        paints: true if it writes textures and nothing else.
+        sees_otherwise: true if it shows other surfaces: from another place, through another lens, or behind a
+            surface that was opaque.
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
@@ -252,9 +270,10 @@ class RenderPerturbation(Perturbation):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: object) -> None:
-        if others := {*cls.fields} - {*FIELDS}:
+        unsupported = {*cls.fields} - {*FIELDS}
+        if unsupported:
             raise TypeError(
-                f"{cls.__name__} writes {sorted(others)}, which pictures would not follow: make it a "
+                f"{cls.__name__} writes {sorted(unsupported)}, which pictures would not follow: make it a "
                 "PhysicsPerturbation, which changes the scene before it is replayed"
             )
         cls.paints = cls.fields == ("tex_data",)
@@ -266,36 +285,36 @@ class RenderPerturbation(Perturbation):
 
 
 class PhysicsPerturbation(Perturbation):
-    """Changes what happens: the scene before the first step, and so the whole replay.
+    """Change of the scene before the first step, and so of the whole replay.
 
-    What acts in the course of the episode, such as another posture of the controller, is a field of ``Scene``, which is
-    stored with the trajectory: ``apply`` sets it, and the environment acts by it wherever the scene is run.
+    A change that acts during the episode, such as another posture of the controller, is a field of ``Scene``.
+    ``apply`` sets this field, the trajectory stores it, and the environment applies it wherever the scene is run.
     """
 
     layer: ClassVar[Layer] = Layer.PHYSICS
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The changed ``scene``, in which ``demo`` is replayed.
+        """Return the changed ``scene``, in which ``demo`` is replayed.
 
         Args:
-            roll_out: gives the states that the demonstration's actions lead to from a scene; costs a whole replay.
+            roll_out: returns the states that the demonstration's actions lead to from a scene; costs a whole replay.
 
         Raises:
-            RefusedError: when the change cannot be made here; its reason is written into the manifest.
+            RefusedError: when the change is impossible in this scene; its reason is written into the manifest.
         """
         raise NotImplementedError
 
     def fault_of(self, actions: Floats) -> str | None:
-        """Return why a replay with these executed actions (K, 7) does not show the change as promised, else ``None``.
+        """Return why a replay with these executed actions (K, 7) does not show the planned change, else ``None``.
 
         The reason is written into the manifest and the replay is dropped. A tracked replay waits for the hand, so its
-        steps are not those of the demonstration.
+        steps differ from the demonstration's.
         """
         return None
 
 
 def level_from(strength: float) -> int:
-    """The level of a strength that reaches the upper end of level k at k."""
+    """Return the level of ``strength``, on a scale where level k ends at k."""
     return min(max(math.ceil(round(strength, 6)), 1), 5)
 
 
@@ -304,13 +323,14 @@ Number = TypeVar("Number", bound=float)
 
 
 def _ordered(intervals: tuple[tuple[Number, Number], ...]) -> tuple[tuple[Number, Number], ...]:
+    """Check that there are intervals and that each has ``low <= high``."""
     if not intervals or any(low > high for low, high in intervals):
         raise ValueError(f"expected one or more [low, high] with low <= high, got {[list(i) for i in intervals]}")
     return intervals
 
 
 Intervals = Annotated[tuple[tuple[Number, Number], ...], AfterValidator(_ordered)]
-"""A union of closed intervals, written ``[[low, high], ...]``: ranges with the test set's values cut out."""
+"""Union of closed intervals, written ``[[low, high], ...]``: ranges without the test set's values."""
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 ByLevel = tuple[T, T, T, T, T]
@@ -319,9 +339,9 @@ Degrees = Annotated[float, Field(ge=-180.0, le=180.0)]
 
 
 def draw(rng: np.random.Generator, intervals: Intervals[float]) -> float:
-    """One number, uniform over the union of ``intervals`` and rounded to four decimals (as it will be recorded).
+    """Sample one number, uniform over the union of ``intervals``, rounded to four decimals (as it is recorded).
 
-    Of points alone, each as often as the others; beside intervals, a point never comes.
+    If all intervals are points, each has equal probability. A point next to longer intervals is never sampled.
     """
     lengths = [high - low for low, high in intervals]
     if len(intervals) > 1 and not any(lengths):
@@ -335,11 +355,11 @@ def draw(rng: np.random.Generator, intervals: Intervals[float]) -> float:
 
 
 def pick(rng: np.random.Generator, choices: Sequence[T]) -> T:
-    """One of ``choices``, each as often as the others."""
+    """Sample one of ``choices``, each with equal probability."""
     return choices[int(rng.integers(len(choices)))]
 
 
 def point(rng: np.random.Generator, distance: float) -> tuple[float, float]:
-    """A point (x, y) so far from the origin, in any direction, rounded as ``draw`` does."""
+    """Sample a point (x, y) at ``distance`` from the origin, in any direction, rounded as in ``draw``."""
     bearing_rad = rng.uniform(-math.pi, math.pi)
     return round(distance * math.cos(bearing_rad), 4), round(distance * math.sin(bearing_rad), 4)

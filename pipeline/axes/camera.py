@@ -1,4 +1,4 @@
-"""Camera: where the agent view is seen from. Render layer; the wrist view moves with the arm and never changes."""
+"""Camera: pose of the agent view. Render layer; the wrist view moves with the arm and never changes."""
 
 from __future__ import annotations
 
@@ -32,18 +32,20 @@ if TYPE_CHECKING:
 Component = Literal["distance", "spherical", "orientation"]
 
 ORBIT_CENTRE_M = np.array([0.0, 0.0, 0.8])
-"""World point about which LIBERO-Plus turns the camera and scales its distance, the same for every arena
+"""World point about which LIBERO-Plus turns the camera and scales its distance, identical for every arena
 (`Problem._setup_camera` of LIBERO-Plus)."""
 
 STEEPEST_DEG = 60.5
-"""How far the study's agent view, the steepest of the five arenas, stands above the orbit centre's horizon. There a
-degree of azimuth spans the least of the sphere, so what is clear of the test cameras there is clear in every arena."""
+"""Elevation of the study's agent view, the steepest of the five arenas, above the orbit centre's horizon.
+
+There a degree of azimuth spans the smallest arc of the sphere. A camera at its clearance from the test cameras there is
+at its clearance in every arena."""
 
 PARAMETERS = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
-"""What places a camera, in draws and in test tasks."""
+"""Parameters that place a camera, in perturbations and in test tasks."""
 
 NEAREST = 0.01
-"""The least multiple of the distance that can be asked for; draws are recorded with four decimals."""
+"""Least multiple of the distance that a configuration can ask for; perturbations are recorded with four decimals."""
 
 
 class CameraPerturbation(RenderPerturbation):
@@ -60,10 +62,13 @@ class CameraPerturbation(RenderPerturbation):
         pitch_deg: turn in place about the world's y axis; positive looks further down.
 
     The paper keeps training cameras 5 degrees from test cameras on the sphere. Two cameras can also stand on one ray
-    from the orbit centre: the test set's changes of distance and turns in place all do. So the distance between two
-    cameras is the largest of three angles, and is zero only for the same picture: the one between their rays; the one
-    between their turns in place; and the logarithm of the ratio of their distances read as radians, because along the
-    ray it moves a camera by as much as the angle does across it (5 degrees are a ratio of 1.091).
+    from the orbit centre: the test set's changes of distance and turns in place all do. The distance between two
+    cameras is therefore the largest of three angles, and is zero only for equal pictures:
+
+    * the angle between their rays,
+    * the angle between their turns in place,
+    * the logarithm of the ratio of their distances in radians. Along the ray it moves a camera by as much as an equal
+      angle does across the ray; 5 degrees are a ratio of 1.091.
     """
 
     axis: Literal["camera"] = "camera"
@@ -84,7 +89,7 @@ class CameraPerturbation(RenderPerturbation):
     )
 
     def pose(self, pos_m: Floats, quat_wxyz: Floats) -> tuple[Floats, Floats]:
-        """The perturbed pose of a camera whose nominal world pose is ``pos_m`` (3,), ``quat_wxyz`` (4,)."""
+        """Return the perturbed pose of a camera whose nominal world pose is ``pos_m`` (3,), ``quat_wxyz`` (4,)."""
         lift = about("y", -self.elevation_deg)
         turn = about("z", self.azimuth_deg)
         pos = rotate(lift, pos_m - ORBIT_CENTRE_M) + ORBIT_CENTRE_M
@@ -96,27 +101,30 @@ class CameraPerturbation(RenderPerturbation):
         return pos, quat
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Move the model's agent view; nothing else in the model changes."""
+        """Move the model's agent view and change nothing else."""
         camera = model.camera("agentview")
         camera.pos[:], camera.quat[:] = self.pose(camera.pos.copy(), camera.quat.copy())
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """To all test cameras, whichever task they are for: many tasks share one nominal view."""
-        cameras, which = _test_cameras(test)
-        return self._angles_deg(cameras)[which]
+        """Return the distances (N,) to the test cameras of all tasks, because many tasks share one nominal view."""
+        cameras, places = _test_cameras(test)
+        return self._angles_deg(cameras)[places]
 
     def apart(self, others: Sequence[CameraPerturbation]) -> Floats:
-        """To all cameras, whichever task they are for."""
-        return self._angles_deg(_embed(np.array([other._parameters() for other in others])))
+        """Return the distances (N,) to other cameras, for any tasks."""
+        parameters = [perturbation._parameters() for perturbation in others]
+        return self._angles_deg(_embed(np.array(parameters)))
 
     def _angles_deg(self, cameras: _Cameras) -> Floats:
-        own = _embed(np.array([self._parameters()]))
-        sphere = _angle_deg(cameras.rays @ own.rays[0])
-        turn = 2 * _angle_deg(np.abs(cameras.turns @ own.turns[0]))
-        dolly = np.rad2deg(np.abs(cameras.log_scales - own.log_scales[0]))
+        """Return the distances (N,) to N cameras in degrees."""
+        camera = _embed(np.array([self._parameters()]))
+        sphere = _angle_deg(cameras.rays @ camera.rays[0])
+        turn = 2 * _angle_deg(np.abs(cameras.turns @ camera.turns[0]))
+        dolly = np.rad2deg(np.abs(cameras.log_scales - camera.log_scales[0]))
         return np.asarray(np.maximum(np.maximum(sphere, turn), dolly))
 
     def _parameters(self) -> tuple[float, ...]:
+        """Return the values of ``PARAMETERS``."""
         return tuple(getattr(self, name) for name in PARAMETERS)
 
 
@@ -129,7 +137,7 @@ class _Cameras(NamedTuple):
 
 
 def _embed(parameters: Floats) -> _Cameras:
-    """``PARAMETERS`` (N, 5) in the steepest arena."""
+    """Convert ``PARAMETERS`` (N, 5) into cameras of the steepest arena."""
     azimuth_deg, elevation_deg, scale, yaw_deg, pitch_deg = parameters.T
     h, v = np.deg2rad(azimuth_deg), np.deg2rad(STEEPEST_DEG + elevation_deg)
     rays = np.stack([np.cos(v) * np.cos(h), np.cos(v) * np.sin(h), np.sin(v)], axis=1)
@@ -141,18 +149,23 @@ def _embed(parameters: Floats) -> _Cameras:
 
 
 def _angle_deg(cosine: Floats) -> Floats:
+    """Convert cosines into angles in degrees."""
     return np.asarray(np.rad2deg(np.arccos(cosine.clip(-1, 1))))
 
 
 @lru_cache(maxsize=4)
 def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
-    """The distinct cameras of the test set, and which of them each test task has."""
-    listed = [[float(task.parameters[name]) for name in PARAMETERS] for task in test.of("camera")]
-    distinct, which = np.unique(np.array(listed).reshape(-1, len(PARAMETERS)), axis=0, return_inverse=True)
-    return _embed(distinct), which.reshape(-1)
+    """Return the distinct cameras of the test set, and each test task's index among them."""
+    listed = []
+    for task in test.of("camera"):
+        listed.append([float(task.parameters[name]) for name in PARAMETERS])
+    parameters = np.array(listed).reshape(-1, len(PARAMETERS))
+    distinct, places = np.unique(parameters, axis=0, return_inverse=True)
+    return _embed(distinct), places.reshape(-1)
 
 
 def _positive(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """Check that all distances are at least ``NEAREST``."""
     if any(low < NEAREST for low, _ in intervals):
         raise ValueError(f"a distance is a positive multiple of the nominal one, {NEAREST} or more")
     return intervals
@@ -164,6 +177,7 @@ Angles = Intervals[Degrees]
 
 
 def _both_ways(low: float, high: float) -> Angles:
+    """Return the intervals of angles with a size from ``low`` to ``high``, in both directions."""
     return ((-high, -low), (low, high))
 
 
@@ -223,7 +237,7 @@ class AsideRange(Frozen):
     turn_deg: Angles = ((5.1, 8.0),)
 
     def draw(self, rng: np.random.Generator, kind: Aside) -> dict[str, float]:
-        """The parameters of one kind of change."""
+        """Sample the parameters of one kind of second change."""
         match kind:
             case "elevation":
                 return {"elevation_deg": draw(rng, self.elevation_deg)}
@@ -241,7 +255,7 @@ ASIDES: dict[Component, tuple[Aside, ...]] = {
     "spherical": ("elevation", "distance", "yaw"),
     "orientation": ("elevation", "distance"),
 }
-"""What a component's draws may change beside what the component is about, each as often as the others."""
+"""Kinds of second change of each component's perturbations, each with equal probability."""
 
 
 class CameraAxis(Axis):
@@ -260,13 +274,14 @@ class CameraAxis(Axis):
 
     @model_validator(mode="after")
     def _some_component(self) -> CameraAxis:
+        """Check that at least one component is left."""
         if not (self.distance or self.spherical or self.orientation):
             raise ValueError("leave at least one of distance, spherical and orientation")
         return self
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
-        """By the distance, by the azimuth, or by the larger of yaw and pitch, in steps of the default ranges."""
+        """Return the level by the distance, the azimuth, or the larger of yaw and pitch, in steps of the defaults."""
         value = {name: float(tested.parameters[name]) for name in PARAMETERS}
         match tested.component:
             case "distance":
@@ -277,7 +292,8 @@ class CameraAxis(Axis):
                 return level_from(max(abs(value["yaw_deg"]), abs(value["pitch_deg"])) / 2)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        chosen = pick(rng, [one for one in (self.distance, self.spherical, self.orientation) if one is not None])
+        components = (self.distance, self.spherical, self.orientation)
+        chosen = pick(rng, [ranges for ranges in components if ranges is not None])
         level = self.draw_level(rng)
         component: Component
         match chosen:

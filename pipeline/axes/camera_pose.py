@@ -1,4 +1,4 @@
-"""Which change of the agent view leads to a pose: the reverse of ``CameraPerturbation.pose``."""
+"""Change of the agent view that leads to a pose: the reverse of ``CameraPerturbation.pose``."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,33 +16,34 @@ AGENT_VIEWS: dict[Arena, tuple[tuple[float, float, float], tuple[float, float, f
     "floor": ((0.8965773716836134, 0.0, 0.65), _LOW_TURN_WXYZ),
     "living_room": ((0.6065773716836134, 0.0, 0.96), _LOW_TURN_WXYZ),
 }
-"""Where LIBERO's agent view stands in the world (m) and how it is turned, by arena (``_setup_camera`` of LIBERO's
+"""Position (m) and orientation of LIBERO's agent view in the world, by arena (``_setup_camera`` of LIBERO's
 problems)."""
 
 UNMOVED = 0.05
-"""Degrees; a camera nearer than this to LIBERO's own was not moved. Matrices are stored in single precision."""
+"""Angle in degrees below which a camera counts as LIBERO's own. Matrices are stored in single precision."""
 
 
 def moved_to(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
-    """The change of the agent view that leads to a pose; None where it was not moved.
+    """Return the change of the agent view that leads to a pose, or ``None`` if the view was not moved.
 
-    A roll, which no test camera has, is left out: the distance to a test camera is then the least that it can be.
+    A roll, which no test camera has, is left out. The distance to a test camera is then the least possible one.
 
     Args:
         extrinsics: (4, 4) from the camera (z forward, y down) to the world.
-        arena: whose own agent view the pose is compared with.
+        arena: arena whose nominal agent view the pose is compared with.
     """
-    own_m, own_wxyz = (np.array(part) for part in AGENT_VIEWS[arena])
-    offset_m, own_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, own_m - ORBIT_CENTRE_M
-    radius_m, own_radius_m = np.linalg.norm(offset_m), np.linalg.norm(own_offset_m)
+    position_m, quat_wxyz = AGENT_VIEWS[arena]
+    offset_m, nominal_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, np.array(position_m) - ORBIT_CENTRE_M
+    radius_m, nominal_radius_m = np.linalg.norm(offset_m), np.linalg.norm(nominal_offset_m)
     azimuth = np.arctan2(offset_m[1], offset_m[0])
-    elevation = np.arcsin(offset_m[2] / radius_m) - np.arcsin(own_offset_m[2] / own_radius_m)
-    own = Rotation.from_quat(np.roll(own_wxyz, -1))
+    elevation = np.arcsin(offset_m[2] / radius_m) - np.arcsin(nominal_offset_m[2] / nominal_radius_m)
+    nominal = Rotation.from_quat(np.roll(np.array(quat_wxyz), -1))
     # MuJoCo's cameras look along -z, with y up.
     turned = Rotation.from_matrix(extrinsics[:3, :3] * [1.0, -1.0, -1.0])
-    in_place = turned * (Rotation.from_euler("z", azimuth) * Rotation.from_euler("y", -elevation) * own).inv()
+    orbited = Rotation.from_euler("z", azimuth) * Rotation.from_euler("y", -elevation) * nominal
+    in_place = turned * orbited.inv()
     yaw, pitch, _ = in_place.as_euler("zyx")
-    scale = float(radius_m / own_radius_m)
+    scale = float(radius_m / nominal_radius_m)
     moved = np.rad2deg([azimuth, elevation, np.log(scale), yaw, -pitch]).tolist()
     if max(map(abs, moved)) < UNMOVED:
         return None

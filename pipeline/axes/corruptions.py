@@ -1,8 +1,8 @@
-"""The image corruptions of the noise axis, each a frozen record of its parameters that acts on one frame.
+"""Image corruptions of the noise axis, each a frozen record of its parameters that acts on one frame.
 
-They are those of ImageNet-C (Hendrycks and Dietterich, 2019) as LIBERO-Plus applies them. What the benchmark computes
-with ImageMagick, scikit-image and SciPy is computed here with the same arithmetic, in the same order where that decides
-a grey level, because every component but motion ends by truncation.
+The corruptions are those of ImageNet-C (Hendrycks and Dietterich, 2019), applied as in LIBERO-Plus. The benchmark
+computes them with ImageMagick, scikit-image and SciPy. This module uses their arithmetic, and their order of operations
+where it decides a grey level, because every component but motion ends by truncation.
 """
 
 import math
@@ -18,19 +18,19 @@ from pipeline.types import Floats, Frame
 
 Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
 SigmaPx = Annotated[float, Field(ge=0.1, le=100.0)]
-"""Of a Gaussian: with less nothing changes, with more all of a frame has one colour."""
+"""Standard deviation of a Gaussian. Smaller values change nothing, larger ones give a whole frame one colour."""
 Pixels = NDArray[np.float32]
 Samples = tuple[NDArray[np.intp], Floats]
-"""Where to sample an axis: (N,) lower neighbours and (N,) fractions of the way to the next pixel."""
+"""Sampling positions along an image axis: lower neighbours (N,) and fractions (N,) of the way to the next pixel."""
 
 
 def _to_frame(image: NDArray[np.floating]) -> Frame:
-    """(H, W, 3) in [0, 1] to grey levels, truncated as the benchmark does."""
+    """Convert an image (H, W, 3) in [0, 1] to grey levels, truncated as in the benchmark."""
     return (image.clip(0, 1) * 255).astype(np.uint8, order="C")
 
 
 def _gaussian_blur(image: Floats, sigma_px: float) -> Floats:
-    """(H, W, 3) blurred per channel by a Gaussian cut at 4 sigma, edges repeated."""
+    """Blur each channel of an image (H, W, 3) by a Gaussian cut off at 4 sigma, with repeated edges."""
     from scipy.ndimage import gaussian_filter  # takes long, and every process of a run imports the axes
 
     return np.asarray(gaussian_filter(image, (sigma_px, sigma_px, 0), mode="nearest", truncate=4))
@@ -55,7 +55,8 @@ class Motion(Frozen):
         step = np.arange(reach + 1)
         weights = np.exp(-(step**2) / (2 * self.sigma_px**2))
         weights /= weights.sum()
-        dy, dx = (np.ceil(step * u - 0.5).astype(int) for u in (math.sin(angle_rad), math.cos(angle_rad)))
+        dy = np.ceil(step * math.sin(angle_rad) - 0.5).astype(int)
+        dx = np.ceil(step * math.cos(angle_rad) - 0.5).astype(int)
         padded = np.pad(frame, ((reach, reach), (0, reach), (0, 0)), mode="edge").astype(np.float32)
         blurred = np.zeros(frame.shape, np.float32)
         for weight, y, x in zip(weights.astype(np.float32), dy + reach, dx, strict=True):
@@ -88,7 +89,7 @@ def _add_resampled(total: Pixels, image: Pixels, rows: Samples, columns: Samples
 
 
 def _magnified(size: int, scale: float) -> Samples:
-    """Sampling that magnifies the central 1/``scale`` of ``size`` pixels to ``size`` pixels again.
+    """Return the positions that magnify the central 1/``scale`` of ``size`` pixels to ``size`` pixels.
 
     The corners of the crop map to the corners of its magnification (``scipy.ndimage.zoom``), which is then trimmed
     around its centre.
@@ -121,7 +122,7 @@ class Zoom(Frozen):
         return _to_frame((image + total) / np.float32(self.copies + 1))
 
     def scales(self) -> Floats:
-        """(copies,) the magnifications, as ``np.arange`` computes them from the step between two."""
+        """Return the magnifications (copies,), as ``np.arange`` computes them from the step between two of them."""
         # Without rounding, the step from 1 to 1.36 in 37 copies would not be the benchmark's 0.01.
         step = round((self.max_scale - 1) / (self.copies - 1), 12)
         # ``np.arange`` adds multiples of the difference of its first two values. Its own end would not be exact.
@@ -130,11 +131,11 @@ class Zoom(Frozen):
 
 
 def _diamond_square(jitter: Floats, roughness_decay: float) -> Floats:
-    """Fractal relief in [0, 1] on a torus whose side is a power of two (Fournier, Fussell and Carpenter, 1982).
+    """Return a fractal relief (S, S) in [0, 1] on a torus (Fournier, Fussell and Carpenter, 1982).
 
     Args:
-        jitter: (S, S) uniform in [-1, 1], the random part of each point; that of (0, 0) is not used.
-        roughness_decay: the amplitude of the random part falls by its square with each halving of the step.
+        jitter: (S, S) uniform in [-1, 1], the random part of each point; S is a power of two, and (0, 0) is not used.
+        roughness_decay: factor whose square divides the amplitude of the random part with each halving of the step.
     """
     side = len(jitter)
     relief = np.zeros_like(jitter)
@@ -174,11 +175,11 @@ class Fog(Frozen):
 
 @compiled
 def _scatter(frame: Frame, offsets: NDArray[np.int8], delta_px: int) -> None:
-    """In place and pixel after pixel, from bottom right to top left, replace each by one of its neighbours.
+    """Replace each pixel by one of its neighbours, in place, one after the other from bottom right to top left.
 
     Args:
         frame: (H, W, 3); rows and columns up to ``delta_px`` and beyond H or W - ``delta_px`` stay as they are.
-        offsets: (passes, H, W, 2) where each pixel is fetched from: rows down, columns right.
+        offsets: (passes, H, W, 2) from each pixel to the pixel that replaces it: rows down, columns right.
     """
     height, width, _ = frame.shape
     for drawn in offsets:

@@ -1,4 +1,4 @@
-"""Disturbance: a push on the robot's hand in the course of the episode. Physics layer."""
+"""Disturbance: a push on the robot's hand during the episode. Physics layer."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from pipeline.libero.starts import kept_actions
 from pipeline.types import Demo, Floats, Push, RollOut, Scene, Task
 
 STEP_S = 1 / SCHEMA.fps_hz
-"""A control step."""
+"""Duration of a control step."""
 
 HAND = "robot0_right_hand"
-"""The body between the arm's last joint and the gripper, which carries both fingers."""
+"""Body between the arm's last joint and the gripper, which carries both fingers."""
 
 RISE = 0.5
-"""Largest sine of the angle between a push and the horizontal plane: 30 degrees up or down, as tables are below."""
+"""Largest sine of the angle between a push and the horizontal plane: 30 degrees up or down, because tables are below.
+"""
 
 Wrench = tuple[float, float, float, float, float, float]
 Steps = Annotated[int, Field(ge=0, le=1000)]
@@ -34,11 +35,12 @@ class DisturbancePerturbation(PhysicsPerturbation):
     """A force on the hand that begins with a control step and ends after some, whatever the policy does.
 
     Attributes:
-        body: of MuJoCo's model, on whose centre of mass the force acts.
-        wrench: (6,) force in N and torque in N m along the world's axes, the same at each of the steps.
-        first_step: executed actions before the push, since the first look.
-        steps: control steps of 50 ms.
-        away_steps: how far it must be from where the gripper opens or closes, at both ends.
+        body: body of MuJoCo's model on whose centre of mass the force acts.
+        wrench: (6,) force in N and torque in N m along the world's axes, constant over the steps.
+        first_step: executed actions between the first observation and the push.
+        steps: duration in control steps of 50 ms.
+        away_steps: least number of control steps between either end of the push and an opening or closing of the
+            gripper.
     """
 
     axis: Literal["disturbance"] = "disturbance"
@@ -55,21 +57,25 @@ class DisturbancePerturbation(PhysicsPerturbation):
     )
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene with the push; where it starts stays as it is.
+        """Return the scene with the push; the initial state stays as it is.
 
         Steps are counted in the demonstration without its no-ops, as it is replayed by default.
 
         Raises:
-            RefusedError: a reason of ``fault_of``, here for the demonstration's own actions.
+            RefusedError: when ``fault_of`` returns a reason for the demonstration's own actions.
         """
-        if fault := self.fault_of(demo.actions[kept_actions(demo.actions, "drop")]):
+        fault = self.fault_of(demo.actions[kept_actions(demo.actions, "drop")])
+        if fault:
             raise RefusedError(fault)
         push = Push(self.body, self.wrench, self.first_step, self.steps)
         return replace(scene, push=push, resolved={**scene.resolved, "disturbance": push._asdict()})
 
     def fault_of(self, actions: Floats) -> str | None:
-        """Return ``push_at_grasp`` where the gripper opens or closes within ``away_steps`` of the push,
-        ``push_after_end`` where the actions (K, 7) end within them, else ``None``."""
+        """Return the reason why the push does not fit the executed ``actions`` (K, 7), else ``None``.
+
+        ``push_at_grasp``: the gripper opens or closes within ``away_steps`` of the push.
+        ``push_after_end``: the actions end within ``away_steps`` of the push, or before.
+        """
         gripper, end = actions[:, 6], self.first_step + self.steps
         if end + self.away_steps > len(gripper):
             return "push_after_end"
@@ -78,13 +84,13 @@ class DisturbancePerturbation(PhysicsPerturbation):
 
     @property
     def impulse_n_s(self) -> Floats:
-        """(3,) along the world's axes."""
+        """Impulse (3,) of the push along the world's axes."""
         return np.array(self.wrench[:3]) * self.steps * STEP_S
 
     def apart(self, others: Sequence[DisturbancePerturbation]) -> Floats:
-        """Compared with the pushes that begin at the same step."""
-        apart_n_s = [float(np.linalg.norm(self.impulse_n_s - other.impulse_n_s)) for other in others]
-        return np.where([self.first_step == other.first_step for other in others], apart_n_s, math.nan)
+        """Return the distances (N,) to pushes that begin at the same step; NaN for pushes at another step."""
+        apart_n_s = [float(np.linalg.norm(self.impulse_n_s - push.impulse_n_s)) for push in others]
+        return np.where([self.first_step == push.first_step for push in others], apart_n_s, math.nan)
 
 
 class DisturbanceAxis(Axis):
@@ -107,8 +113,10 @@ class DisturbanceAxis(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> DisturbancePerturbation:
         level = self.draw_level(rng)
-        steps, first_step = _step(rng, self.steps), _step(rng, self.first_step)
-        bearing_rad, rise = rng.uniform(-math.pi, math.pi), rng.uniform(-RISE, RISE)
+        steps = _step(rng, self.steps)
+        first_step = _step(rng, self.first_step)
+        bearing_rad = rng.uniform(-math.pi, math.pi)
+        rise = rng.uniform(-RISE, RISE)
         flat = math.sqrt(1 - rise**2)
         direction = np.array([flat * math.cos(bearing_rad), flat * math.sin(bearing_rad), rise])
         force_n = direction * self.impulse_n_s[level - 1] / (steps * STEP_S)
@@ -123,6 +131,6 @@ class DisturbanceAxis(Axis):
 
 
 def _step(rng: np.random.Generator, stretches: Intervals[int]) -> int:
-    """One step of one of the stretches, both ends among them."""
+    """Sample one of the stretches, then one of its steps, both ends included."""
     first, last = pick(rng, stretches)
     return int(rng.integers(first, last + 1))

@@ -1,11 +1,11 @@
 """Language: the instruction reworded; the demonstration and its frames stay as they are.
 
-The distance of two wordings is their normalised edit distance: the fewest characters to insert, delete or replace
-to turn one into the other, by the length of the longer, both without case and punctuation.
+The distance of two wordings is their normalised edit distance, both without case and punctuation: the fewest characters
+to insert, delete or replace to turn the first into the second, divided by the length of the longer.
 
-The rewrites live in ``language_bank.yaml``, one list for each task and class. All are lower-case ASCII without a
-final full stop, as LIBERO's own instructions are, each keeps one reading among the objects of its scene, and each
-keeps the goal as far as ``language_goal.py`` can check.
+The rewrites are stored in ``language_bank.yaml``, one list for each task and class. All are lower-case ASCII without a
+final full stop, as LIBERO's own instructions are. Each keeps one reading among the objects of its scene, and keeps the
+goal as far as ``language_goal.py`` can check.
 """
 
 from __future__ import annotations
@@ -52,19 +52,21 @@ class LanguagePerturbation(TextPerturbation):
     measure: ClassVar[str] = "to the task's test instructions without case and punctuation"
 
     def apply(self, instruction: str) -> str:
-        """The wording that takes the place of ``instruction``."""
+        """Return the wording that replaces ``instruction``."""
         return self.text
 
     same: ClassVar[Same | None] = "task"
 
     def distances_on(self, test: TestSet, task: Task) -> list[float]:
-        """To the task's test instructions; a clearance of about one word in five."""
+        """Return the distances to the task's test instructions; the clearance is about one word in five."""
         return _distances(self.text, test, task)
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """As the base class says; 0 where it is word for word a test instruction of any task."""
-        found = super().nearest(test, task)
-        return found._replace(distance=0.0) if normalise(self.text) in _all_test_wordings(test) else found
+        """Return the distance to the nearest test instruction, or 0 if ``text`` is a test instruction of any task."""
+        nearest = super().nearest(test, task)
+        if normalise(self.text) in _all_test_wordings(test):
+            return nearest._replace(distance=0.0)
+        return nearest
 
 
 class LanguageAxis(Axis):
@@ -82,27 +84,31 @@ class LanguageAxis(Axis):
     bank: Place | None = None
 
     def beside(self, axes: Collection[str]) -> LanguageAxis:
-        """Among objects that the layout axis adds: of the classes ``NAMED`` only.
+        """Return the axis, restricted to the classes ``NAMED`` if the layout axis adds objects.
 
-        Names stay unambiguous there as far as the added objects are of categories that the scene does not have.
+        Names stay unambiguous then, because the scene has no objects of the added categories.
 
         Raises:
             ValueError: when none of ``classes`` is left.
         """
-        if not (classes := self._classes(axes)):
+        classes = self._classes(axes)
+        if not classes:
             raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")
         return self.model_copy(update={"classes": classes})
 
     def _classes(self, axes: Collection[str]) -> tuple[Component, ...]:
-        return tuple(one for one in self.classes if one in NAMED) if "layout" in axes else self.classes
+        """Return the classes to sample if episodes are perturbed on all of ``axes`` together."""
+        if "layout" not in axes:
+            return self.classes
+        return tuple(component for component in self.classes if component in NAMED)
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
-        """By the edit distance to the instruction of the LIBERO task, as rewrites."""
+        """Return the level by the edit distance to the LIBERO task's instruction, as for rewrites."""
         return level_of(str(tested.parameters["text"]), find_task(tested.suite, tested.base).instruction)
 
     def entries(self, task: Task) -> tuple[str, ...]:
-        """The task's rewrites.
+        """List the task's rewrites in the order of ``deal``.
 
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
@@ -110,9 +116,9 @@ class LanguageAxis(Axis):
         return tuple(rewrite.text for rewrite in deal(task, self.classes, self.levels, self.bank))
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
-        """The rewrite at ``place`` of the task's list, which starts again at its end.
+        """Return the rewrite at ``place`` of the task's list, which starts again at its end.
 
-        Independent draws would repeat, so whoever samples deals out the places and ``rng`` is left alone.
+        The caller deals out the places, because independent random choices would repeat. ``rng`` is not used.
 
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
@@ -121,31 +127,35 @@ class LanguageAxis(Axis):
         return rewrites[place % len(rewrites)]
 
     def wordings(self, task: Task, axes: Collection[str], test: TestSet) -> tuple[str, ...]:
-        """All that it can draw for a task beside other axes, as far as it keeps clear of the benchmark's instructions.
+        """List the rewrites of a task, perturbed on ``axes`` together, that keep their clearance to test instructions.
 
-        None where no bank has any.
+        The result is empty if no bank has rewrites of the task.
 
         Raises:
-            PipelineError: when one of them does not pass ``lint``.
+            PipelineError: when one of the rewrites does not pass ``lint``.
         """
-        rewrites = _dealt(task, self._classes(axes), self.levels, self.bank)
-        return tuple(one.text for one in rewrites if one.nearest(test, task).distance >= one.clearance)
+        texts = []
+        for rewrite in _dealt(task, self._classes(axes), self.levels, self.bank):
+            if rewrite.nearest(test, task).distance >= rewrite.clearance:
+                texts.append(rewrite.text)
+        return tuple(texts)
 
 
 @cache
 def load_bank(file: Path = BANK_FILE) -> Bank:
-    """``read_bank``, once a process; the one that is shipped by default."""
+    """Read a bank once per process, by default the shipped one."""
     return read_bank(file)
 
 
 def read_bank(file: Path) -> Bank:
-    """A bank as stored.
+    """Read a bank from its file.
 
     Raises:
         PipelineError: when the file does not have the bank's form.
     """
     try:
-        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), FastStrictLoader) or {})
+        content = yaml.load(file.read_text(encoding="ascii"), FastStrictLoader) or {}
+        return TypeAdapter(Bank).validate_python(content)
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         raise PipelineError(
             f"not a bank of rewrites ({error})",
@@ -161,12 +171,13 @@ def deal(
     levels: tuple[Level, ...] = get_args(Level),
     bank: Path | None = None,
 ) -> tuple[LanguagePerturbation, ...]:
-    """All rewrites of a task in the order they are drawn: shuffled by task, one class after the other in turn.
+    """List all rewrites of a task in the order in which they are dealt: shuffled by task, the classes taking turns.
 
     Raises:
         PipelineError: when there are none, or one of them does not pass ``lint``.
     """
-    if dealt := _dealt(task, classes, levels, bank):
+    dealt = _dealt(task, classes, levels, bank)
+    if dealt:
         return dealt
     raise PipelineError(
         f"task {task} has no rewrites of class {' or '.join(classes)} at level {' or '.join(map(str, levels))}",
@@ -180,59 +191,88 @@ def deal(
 def _dealt(
     task: Task, classes: tuple[Component, ...], levels: tuple[Level, ...], bank: Path | None
 ) -> tuple[LanguagePerturbation, ...]:
-    banks = (load_bank(), load_bank(bank)) if bank else (load_bank(),)
-    # Of wordings that only case or punctuation tells apart, the first counts, whatever the classes.
-    first: dict[str, tuple[Component, str]] = {}
-    for bank_of_task in (one.get(task.suite, {}).get(task.name, {}) for one in banks):
-        for component, texts in bank_of_task.items():
-            for text in texts:
-                first.setdefault(normalise(text), (component, text))
-    stored = {name: tuple(text for component, text in first.values() if component == name) for name in CLASSES}
+    """List all rewrites of a task in the order of ``deal``; empty if there are none.
+
+    Raises:
+        PipelineError: when one of the rewrites does not pass ``lint``.
+    """
+    stored = _stored(task, bank)
     turn = seeding.rng("language", task.suite, task.name).permutation(list(dict.fromkeys(classes)))
-    columns = [_shuffled(task, component, stored[component], levels) for component in turn.tolist()]
-    dealt = tuple(card for row in zip_longest(*columns) for card in row if card is not None)
-    for card in dealt:
-        if fault := lint(card.text, task, card.component):
+    columns = [_shuffled(task, component, tuple(stored[component]), levels) for component in turn.tolist()]
+    dealt: list[LanguagePerturbation] = []
+    for row in zip_longest(*columns):
+        dealt += [rewrite for rewrite in row if rewrite is not None]
+    for rewrite in dealt:
+        fault = lint(rewrite.text, task, rewrite.component)
+        if fault:
             raise PipelineError(
-                f"{card.component} rewrite {card.text!r} of {task} is refused: {fault}",
+                f"{rewrite.component} rewrite {rewrite.text!r} of {task} is refused: {fault}",
                 where=bank or BANK_FILE,
                 expected=f"lower-case ASCII, {LENGTH}, no final punctuation, the task's goal",
                 remedy=REMEDY,
             )
-    return dealt
+    return tuple(dealt)
+
+
+def _stored(task: Task, bank: Path | None) -> dict[Component, list[str]]:
+    """Collect a task's rewrites from the shipped bank and ``bank``, by class.
+
+    Wordings that differ in case or punctuation alone count once, at their first place in any class.
+    """
+    banks = (load_bank(), load_bank(bank)) if bank else (load_bank(),)
+    stored: dict[Component, list[str]] = {component: [] for component in CLASSES}
+    listed: set[str] = set()
+    for suites in banks:
+        for component, texts in suites.get(task.suite, {}).get(task.name, {}).items():
+            for text in texts:
+                wording = normalise(text)
+                if wording not in listed:
+                    listed.add(wording)
+                    stored[component].append(text)
+    return stored
 
 
 def _shuffled(
     task: Task, component: Component, texts: tuple[str, ...], levels: tuple[Level, ...]
 ) -> list[LanguagePerturbation]:
+    """Shuffle one class of a task's rewrites, and keep those of ``levels``."""
     order = seeding.rng("language", task.suite, task.name, component).permutation(len(texts))
-    cards = (
-        LanguagePerturbation(component=component, text=texts[i], level=level_of(texts[i], task.instruction))
-        for i in order
-    )
-    return [card for card in cards if card.level in levels]
+    rewrites = []
+    for index in order:
+        text = texts[index]
+        level = level_of(text, task.instruction)
+        if level in levels:
+            rewrites.append(LanguagePerturbation(component=component, text=text, level=level))
+    return rewrites
 
 
 def level_of(text: str, original: str) -> Level:
-    """The strength of a rewrite, by the ranges of ``LEVELS``."""
+    """Return the strength of a rewrite, by the ranges of ``LEVELS``."""
     level: Level = get_args(Level)[bisect.bisect_right(LEVELS, distance(text, original))]
     return level
 
 
 def distance(text: str, other: str) -> float:
-    """Normalised edit distance: 0 for wordings that differ in case and punctuation at most, 1 at most."""
-    one, two = _characters(text), _characters(other)
-    return int(_edits(one, two)) / max(len(one), len(two), 1)
+    """Return the normalised edit distance of two wordings, from 0 to 1.
+
+    It is 0 for wordings that differ in case and punctuation alone.
+    """
+    first, second = _characters(text), _characters(other)
+    return int(_edits(first, second)) / max(len(first), len(second), 1)
 
 
 @cache
 def _characters(text: str) -> NDArray[np.uint8]:
+    """Return the bytes (N,) of a normalised text."""
     return np.frombuffer(normalise(text).encode(), np.uint8)
 
 
 @compiled
 def _edits(one: NDArray[np.uint8], two: NDArray[np.uint8]) -> int:
-    """Levenshtein distance, row by row: ``row[j]`` is that of what was read of ``one`` to the first j of ``two``."""
+    """Compute the Levenshtein distance, row by row.
+
+    ``row[j]`` is the distance between the part of ``one`` that was read so far and the first j characters of ``two``.
+    """
     row = np.arange(len(two) + 1)
     for i in range(len(one)):
         diagonal, row[0] = row[0], i + 1
@@ -245,9 +285,11 @@ def _edits(one: NDArray[np.uint8], two: NDArray[np.uint8]) -> int:
 
 @cache
 def _distances(text: str, test: TestSet, task: Task) -> list[float]:
+    """List the distances of ``text`` to the task's test instructions."""
     return [distance(text, str(tested.parameters["text"])) for tested in test.on(task, "language")]
 
 
 @cache
 def _all_test_wordings(test: TestSet) -> frozenset[str]:
+    """Return the normalised test instructions of all tasks."""
     return frozenset(normalise(str(tested.parameters["text"])) for tested in test.of("language"))

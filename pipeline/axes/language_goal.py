@@ -1,11 +1,14 @@
-"""Whether a rewrite keeps the goal of its task: what is moved, where to, how it then stands, what is opened or lit.
+"""Check that a rewrite keeps its task's goal: moved things, their places and relations, and states such as open or lit.
 
-The goal is that of the BDDL file, the words for it are those of ``language_words.yaml``. No grammar is parsed: each
-thing and each place must be called by a word that nothing else in the scene shares, the relation is given by the words
-right before a place, and where two things go to different places, the first goes to the first. What LIBERO's own
-wording does not say by these words is not asked of a rewrite. So a goal that is left out is found, where things are
-named and where they are described. A second goal is found by ``language_extra.py``. The opposite ("do not") is not
-found, nor whether a description fits one thing only: writers check that.
+The goal comes from the BDDL file, its words from ``language_words.yaml``. No grammar is parsed:
+
+* Each thing and each place must have a word that nothing else in the scene shares.
+* The words right before a place give the relation to it.
+* If two things go to different places, the first thing goes to the first place.
+
+A rewrite need not say what LIBERO's own wording does not say by these words. The check finds a missing goal, for named
+and for described things. ``language_extra.py`` finds a second goal. Neither finds the opposite ("do not"), nor
+descriptions that fit several things: writers check these.
 """
 
 import re
@@ -25,21 +28,21 @@ SIDES = ("front", "left", "right")
 """Relations that may be given without a word for the place, as in ``to its right``."""
 
 UNTOLD = frozenset({"to", None})
-"""What leaves the relation open: ``bring it to the basket``, ``the basket should have it``."""
+"""Relations that leave the position open: ``bring it to the basket``, ``the basket should have it``."""
 
 WAYS = frozenset({"on", "in", "off", "to", None})
-"""Relations that name no place where they are followed by another: ``hold it over the basket and let it in``."""
+"""Relations that name no place if a second relation follows: ``hold it over the basket and let it in``."""
 
 DRAWERS = frozenset({"top", "middle", "bottom"})
 
 NEAR_WORDS = 5
-"""A relation belongs to a place that at most so many words come before."""
+"""Most words between a relation and the place that it belongs to."""
 
 _BACK = re.compile(
     r"\s*(?:$|[,.;:?!]|(?:and|it|its|that|this|there|these|those|them|which|each|one|what)\b"
     r"|the (?:former|latter|other)\b)"
 )
-"""What follows a relation to a place that was named before."""
+"""Text after a relation to a place that was named before."""
 
 
 Entries = Annotated[tuple[str, ...], BeforeValidator(lambda listed: re.split(r",\s+", listed))]
@@ -47,18 +50,20 @@ Entries = Annotated[tuple[str, ...], BeforeValidator(lambda listed: re.split(r",
 
 
 class Thing(Frozen):
-    """What a kind of thing is called, and how else it can be described."""
+    """Names and descriptions of a kind of thing."""
 
     names: Entries
     hints: Entries
 
 
 class State(Frozen):
-    """How a state is asked for, and how its opposite is.
+    """Words that ask for a state, and for its opposite.
 
     Attributes:
-        asked: how it is asked for with the thing, for which ``IT`` stands, or a pronoun.
-        wished: how its result is wished for; ``THING`` stands for the thing without an article.
+        said: words for the state.
+        opposite: words for its opposite.
+        asked: requests for the state; ``IT`` stands for the thing or a pronoun.
+        wished: wishes for its result; ``THING`` stands for the thing without an article.
         of: kinds that can be in the state.
     """
 
@@ -70,7 +75,7 @@ class State(Frozen):
 
 
 class Words(Frozen):
-    """``language_words.yaml``; every string is a regular expression."""
+    """Content of ``language_words.yaml``; every string is a regular expression."""
 
     things: dict[str, Thing]
     parts: dict[str, Entries]
@@ -86,51 +91,78 @@ class Words(Frozen):
 
 @cache
 def words() -> Words:
-    """The words that are shipped."""
-    return Words.model_validate(yaml.safe_load(Path(__file__).with_name("language_words.yaml").read_text("ascii")))
+    """Read the shipped words."""
+    text = Path(__file__).with_name("language_words.yaml").read_text("ascii")
+    return Words.model_validate(yaml.safe_load(text))
 
 
 @cache
 def thing_words(scene: tuple[str, ...], hints: bool) -> Mapping[str, tuple[str, ...]]:
-    """Word to the kinds that it may mean in a scene; a kind that is not listed goes by its own name."""
+    """Map each word to the kinds that it may mean in a scene; an unlisted kind has its own name.
+
+    Args:
+        hints: true if words that describe a thing count in addition to its names.
+    """
     meant: dict[str, tuple[str, ...]] = {}
     for kind in scene:
-        known = words().things.get(kind)
-        names = known.names if known else (kind.replace("_", " "), kind.rpartition("_")[2])
-        for word in dict.fromkeys(names + known.hints if known and hints else names):
+        thing = words().things.get(kind)
+        if thing is None:
+            entries: tuple[str, ...] = (kind.replace("_", " "), kind.rpartition("_")[2])
+        elif hints:
+            entries = thing.names + thing.hints
+        else:
+            entries = thing.names
+        for word in dict.fromkeys(entries):
             meant[word] = (*meant.get(word, ()), kind)
     return meant
 
 
 @cache
 def relation_words() -> Mapping[str, tuple[str, ...]]:
-    return {word: (relation,) for relation, told in words().relations.items() for word in told}
+    """Map each word to the relation that it means, as a tuple with one entry."""
+    meant: dict[str, tuple[str, ...]] = {}
+    for relation, entries in words().relations.items():
+        for word in entries:
+            meant[word] = (relation,)
+    return meant
 
 
 def found(plain: str, meant: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[re.Match[str], tuple[str, ...]]]:
-    """The listed words in a text, with what they mean."""
+    """Find the words of ``meant`` in a text.
+
+    Yields:
+        The match of a word, and the meanings of the word.
+    """
     for match in pattern(tuple(meant)).finditer(plain):
-        yield match, meant[_longest_first(meant)[(match.lastindex or 0) - 1]]
+        word = _longest_first(meant)[(match.lastindex or 0) - 1]
+        yield match, meant[word]
 
 
 def _longest_first(entries: Iterable[str]) -> list[str]:
+    """Sort entries by their length, the longest first."""
     return sorted(entries, key=len, reverse=True)
 
 
 @cache
 def pattern(entries: tuple[str, ...]) -> re.Pattern[str]:
-    """Any of the entries as whole words; the number of the group is the entry's place among the longest first."""
-    groups = (re.sub(r"\((?!\?)", "(?:", entry) for entry in _longest_first(entries))
-    return re.compile(rf"\b(?:{'|'.join(f'({group})' for group in groups)})(?:s|es)?\b")
+    """Compile a pattern of any of the entries as whole words, the longest first.
+
+    The number of the matched group, counted from 1, is the entry's place in this order.
+    """
+    groups = []
+    for entry in _longest_first(entries):
+        without_groups = re.sub(r"\((?!\?)", "(?:", entry)
+        groups.append(f"({without_groups})")
+    return re.compile(rf"\b(?:{'|'.join(groups)})(?:s|es)?\b")
 
 
 class Mention(NamedTuple):
-    """A word for a thing.
+    """Word for a thing.
 
     Attributes:
-        at, end: where it begins and ends.
-        kinds: those in the scene that share the word.
-        relation: how something stands to it, by the words right before.
+        at, end: positions of its first character and after its last character.
+        kinds: kinds in the scene that share the word.
+        relation: relation of something to the thing, by the words right before.
     """
 
     at: int
@@ -140,134 +172,170 @@ class Mention(NamedTuple):
 
 
 class Reading:
-    """What an instruction says, by its words alone.
+    """Content of an instruction, by its words alone.
 
     Attributes:
         plain: the text in lower case, without hyphens and apostrophes.
+        hints: true if words that describe things count in addition to their names.
         mentions: words for things of the scene, in order.
-        back: relations to a place that was named before, and sides, with where they begin.
+        back: relations to a place that was named before, and sides, each with its position in the text.
     """
 
     def __init__(self, text: str, scene: Sequence[str], hints: bool):
+        """Read ``text`` in a ``scene`` that consists of these kinds of things."""
         self.plain, self.hints = _plain(text), hints
-        relations = [
-            (match.start(), match.end(), relation) for match, (relation,) in found(self.plain, relation_words())
-        ]
-        self.back = [
-            (start, relation) for start, end, relation in relations if relation in SIDES or _BACK.match(self.plain, end)
-        ]
+        relations: list[tuple[int, int, str]] = []
+        for match, (meaning,) in found(self.plain, relation_words()):
+            relations.append((match.start(), match.end(), meaning))
+        self.back: list[tuple[int, str]] = []
+        for start, end, meaning in relations:
+            if meaning in SIDES or _BACK.match(self.plain, end):
+                self.back.append((start, meaning))
         self.mentions: list[Mention] = []
         before = 0
         for match, kinds in found(self.plain, thing_words(tuple(scene), hints)):
-            near = [
-                relation for start, end, relation in relations if start >= before and self._leads(end, match.start())
-            ]
-            relation = near[-1] if near else None
+            relation: str | None = None
+            for start, end, meaning in relations:
+                if start >= before and self._leads(end, match.start()):
+                    relation = meaning
             if self.mentions and self.mentions[-1].relation == "between" and self._joins(before, match.start()):
                 relation = "between"
             self.mentions.append(Mention(match.start(), match.end(), kinds, relation))
             before = match.end()
 
     def _leads(self, end: int, start: int) -> bool:
+        """Return whether a relation that ends at ``end`` belongs to the thing that begins at ``start``."""
         between = self.plain[end:start]
         return end <= start and not re.search(r"[,.;:?!]", between) and len(between.split()) <= NEAR_WORDS
 
     def _joins(self, end: int, start: int) -> bool:
+        """Return whether ``and`` joins the thing that ends at ``end`` and the thing that begins at ``start``."""
         return end <= start and re.fullmatch(r" and( \w+){0,3} ", self.plain[end:start]) is not None
 
     def has(self, patterns: Sequence[str]) -> bool:
+        """Return whether the text has one of the ``patterns`` as whole words."""
         return pattern(tuple(patterns)).search(self.plain) is not None
 
     def tells(self, kind: str, moved: frozenset[str]) -> bool:
-        """Whether a word fits this kind and no other in the scene, or both that are moved and no other."""
+        """Return whether a word means this kind alone in the scene, or exactly the two moved kinds together."""
         together = moved if kind in moved and self.has(words().both) else frozenset()
         return any(kind in mention.kinds and {*mention.kinds} <= together | {kind} for mention in self.mentions)
 
     def tells_part(self, part: str) -> bool:
-        """Whether it says which drawer or side, if only by naming both of the other drawers."""
-        others = DRAWERS - {part} if part in DRAWERS and self.hints else {part}
-        return self.has(words().parts[part]) or all(self.has(words().parts[other]) for other in others)
+        """Return whether the text names this drawer or side, or excludes both other drawers by naming them."""
+        if self.has(words().parts[part]):
+            return True
+        if part not in DRAWERS or not self.hints:
+            return False
+        return all(self.has(words().parts[drawer]) for drawer in DRAWERS - {part})
 
     def tells_top(self, top: bool) -> bool:
-        """Whether it says on top of a shelf, or does not, as ``top`` demands: LIBERO says ``on`` of its boards too."""
+        """Return whether the text has words for the top of a shelf exactly if ``top`` is true.
+
+        LIBERO uses ``on`` for the boards of a shelf too.
+        """
         return self.has(words().top) == top
 
     def keeps_outside(self) -> bool:
-        """Whether it names no drawer, where things are called by their names and the top is meant."""
+        """Return whether the text names no drawer, as a place on top demands; texts with ``hints`` always pass."""
         return self.hints or not self.has(words().drawer)
 
     def tells_state(self, state: str) -> bool:
+        """Return whether the text has words for a state and none for its opposite."""
         return self.has(words().states[state].said) and not self.has(words().states[state].opposite)
 
     def relates(self, aim: Aim, accepted: frozenset[str], others: frozenset[str]) -> bool:
-        """Whether the aim's place is named with an accepted relation, or at least with none but those of ``others``."""
-        told = [mention.relation for mention in self.mentions if aim.place in mention.kinds]
+        """Return whether the aim's place has an accepted relation, or no relation that contradicts it.
+
+        Args:
+            accepted: relations that express the aim.
+            others: relations that other parts of the goal explain.
+        """
+        given = [mention.relation for mention in self.mentions if aim.place in mention.kinds]
         back = {relation for _, relation in self.back}
-        if aim.relation in SIDES or accepted & {*told}:
-            return bool(accepted & {*told, *back})
-        unexplained = [relation for relation in told if relation not in others]
+        if aim.relation in SIDES or accepted & {*given}:
+            return bool(accepted & {*given, *back})
+        unexplained = [relation for relation in given if relation not in others]
         if accepted & back:
             return WAYS.issuperset(unexplained)
         return bool(unexplained) and UNTOLD.issuperset(unexplained)
 
     def starts(self, aim: Aim, accepted: frozenset[str], others: frozenset[str]) -> bool:
-        """Whether it says next to or between which things something starts: in so many words if things have names."""
+        """Return whether the text names the things that something starts next to or between.
+
+        The relation must be stated literally if things are called by their names.
+        """
         if self.hints:
             return self.relates(aim, accepted, others)
-        told = {mention.relation for mention in self.mentions if aim.place in mention.kinds}
-        return aim.relation in told | {relation for _, relation in self.back}
+        given = {mention.relation for mention in self.mentions if aim.place in mention.kinds}
+        return aim.relation in given | {relation for _, relation in self.back}
 
     def in_order(self, aims: Sequence[Aim]) -> bool:
-        """Whether the places come in the order of the things that go there."""
-        things = [self._first(one.at for one in self.mentions if one.kinds == (aim.thing,)) for aim in aims]
-        return _ranks(things) == _ranks([self._first(self._places(aim)) for aim in aims])
+        """Return whether the places have the order of the things that go there."""
+        things, places = [], []
+        for aim in aims:
+            things.append(self._first(mention.at for mention in self.mentions if mention.kinds == (aim.thing,)))
+            places.append(self._first(self._places(aim)))
+        return _ranks(things) == _ranks(places)
 
     def _first(self, places: Iterable[int]) -> int:
+        """Return the least of some positions in the text, or the end of the text if there are none."""
         return min(places, default=len(self.plain))
 
     def _places(self, aim: Aim) -> Iterator[int]:
+        """List the positions in the text of the aim's place."""
         if aim.part:
-            yield from (match.start() for match in pattern(words().parts[aim.part]).finditer(self.plain))
+            for match in pattern(words().parts[aim.part]).finditer(self.plain):
+                yield match.start()
             return
-        yield from (start for start, relation in self.back if relation == aim.relation)
-        yield from (
-            one.at for one in self.mentions if aim.place in one.kinds and one.relation in {aim.relation, *UNTOLD}
-        )
+        for start, relation in self.back:
+            if relation == aim.relation:
+                yield start
+        for mention in self.mentions:
+            if aim.place in mention.kinds and mention.relation in {aim.relation, *UNTOLD}:
+                yield mention.at
 
 
 class Demand(NamedTuple):
-    """Something that a rewrite has to say, and the fault where it does not."""
+    """Statement that a rewrite must make, and the fault of a rewrite without it."""
 
     fault: str
     met: Callable[[Reading], bool]
 
 
 def changed_goal(text: str, task: Task, hints: bool) -> str | None:
-    """What of the task's goal ``text`` does not keep; None when it keeps all that is checked.
+    """Return the first part of the task's goal that ``text`` loses, or ``None`` if it keeps all checked parts.
 
     Args:
-        hints: whether things may be described by what one knows of them, and a drawer by exclusion; else by name only.
+        hints: true if things may be described by common knowledge, and a drawer by exclusion; else by name only.
 
     Raises:
         PipelineError: when the task's BDDL file cannot be read.
     """
     reading = Reading(text, read_goal(task.bddl_file).scene, hints)
-    return next((demand.fault for demand in demands(task) if not demand.met(reading)), None)
+    for demand in demands(task):
+        if not demand.met(reading):
+            return demand.fault
+    return None
 
 
 @cache
 def demands(task: Task) -> tuple[Demand, ...]:
-    """What the goal demands of a rewrite, as far as LIBERO's own wording meets it."""
+    """List the goal's demands on a rewrite, as far as LIBERO's own wording meets them."""
     goal = read_goal(task.bddl_file)
     original = Reading(task.instruction, goal.scene, hints=False)
     return tuple(demand for demand in _of_goal(goal, original) if demand.met(original))
 
 
 def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
+    """List the demands of a goal on its rewrites, given LIBERO's ``original`` wording."""
     located = (*goal.aims, *goal.starts)
-    kinds = [kind for aim in located for kind in (aim.thing, aim.place) if kind]
+    kinds = []
+    for aim in located:
+        kinds += [kind for kind in (aim.thing, aim.place) if kind]
+    kinds += [change.thing for change in goal.changes]
     moved = frozenset(aim.thing for aim in goal.aims)
-    for kind in dict.fromkeys([*kinds, *(change.thing for change in goal.changes)]):
+    for kind in dict.fromkeys(kinds):
         yield Demand(f"has no word for the {_name(kind)} alone", partial(Reading.tells, kind=kind, moved=moved))
     parts = [aim.part for aim in located] + [change.part for change in goal.changes]
     parts += _sides(goal, original)
@@ -288,41 +356,56 @@ def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
     states = {change.state for change in goal.changes} | {*words().states} & {*original.plain.split()}
     for state in sorted(states):
         yield Demand(f"does not say to {state}", partial(Reading.tells_state, state=state))
-    if len({aim.thing for aim in goal.aims}) > 1 and len({aim._replace(thing="") for aim in goal.aims}) > 1:
+    destinations = {aim._replace(thing="") for aim in goal.aims}
+    if len(moved) > 1 and len(destinations) > 1:
         yield Demand("lets the things change places", partial(Reading.in_order, aims=goal.aims))
 
 
 def _sides(goal: TaskGoal, original: Reading) -> list[str]:
-    """List the sides in LIBERO's wording, where no name tells a moved thing from the others of its kind or name."""
+    """List the sides in LIBERO's wording if a moved thing shares its kind or name with another thing."""
     moved = frozenset(aim.thing for aim in goal.aims)
     named = all(original.tells(kind, moved) for kind in moved) and not goal.pairs
     return [] if named else [side for side in words().sides if side in original.plain.split()]
 
 
 def _on_shelf(top: bool) -> str:
+    """Return the fault of a rewrite that does not keep a shelf's top, or its inside if ``top`` is false."""
     return "does not say on top of the shelf" if top else "says on top of the shelf, which is another place"
 
 
 def _relation(aim: Aim, goal: TaskGoal, original: Reading) -> Callable[[Reading], bool]:
-    """The demand for an aim's relation, in LIBERO's wording too: what is on a bowl is in it; a start is left."""
-    same_place = [one.relation for one in (*goal.aims, *goal.starts) if one.place == aim.place and one != aim]
-    others = frozenset(relation for relation in same_place if relation)
-    worded = {one.relation for one in original.mentions if one.relation and aim.place in one.kinds} - others
+    """Return the check of an aim's relation, which accepts the relation of LIBERO's wording too.
+
+    For example, a goal puts a thing *on* a bowl and LIBERO's wording *in* it. A thing is taken *off* its start.
+    """
+    others: set[str] = set()
+    for located in (*goal.aims, *goal.starts):
+        if located.place == aim.place and located != aim and located.relation:
+            others.add(located.relation)
+    worded: set[str] = set()
+    for mention in original.mentions:
+        if mention.relation and aim.place in mention.kinds and mention.relation not in others:
+            worded.add(mention.relation)
     also = {"off"} if aim in goal.starts else worded
-    others |= {"off"} if any(one.place == aim.place for one in goal.starts) else frozenset()
+    if any(start.place == aim.place for start in goal.starts):
+        others.add("off")
     accepted = frozenset({str(aim.relation), *also})
+    explained = frozenset(others)
     if aim in goal.starts and aim.relation in ("next to", "between"):
-        return partial(Reading.starts, aim=aim, accepted=accepted, others=others)
-    return partial(Reading.relates, aim=aim, accepted=accepted, others=others)
+        return partial(Reading.starts, aim=aim, accepted=accepted, others=explained)
+    return partial(Reading.relates, aim=aim, accepted=accepted, others=explained)
 
 
 def _name(kind: str) -> str:
+    """Return a kind in plain words."""
     return kind.replace("_", " ")
 
 
 def _plain(text: str) -> str:
+    """Return a text in lower case, without hyphens, apostrophes and repeated white space."""
     return " ".join(re.sub(r"[-']", " ", text.lower()).split())
 
 
 def _ranks(places: Sequence[int]) -> list[int]:
+    """Return the indices that sort ``places``."""
     return sorted(range(len(places)), key=places.__getitem__)

@@ -1,4 +1,4 @@
-"""Whether a sentence can take the place of an instruction, by its form and, as far as it can be checked, its goal."""
+"""Check of a sentence as a replacement of an instruction: its form and, as far as it can be checked, its goal."""
 
 import re
 from typing import Literal, get_args
@@ -11,17 +11,19 @@ from pipeline.types import Task
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
 CLASSES: tuple[Component, ...] = get_args(Component)
 NAMED: tuple[Component, ...] = ("distraction", "paraphrase")
-"""The classes that call all things and places of the goal by their names; the others may describe them by what one
-knows of them, or by exclusion (``the only dairy product``), which holds for the task's own objects and no more."""
+"""Classes that call all things and places of the goal by their names.
+
+The other classes may describe them by common knowledge, or by exclusion (``the only dairy product``). Such a
+description holds among the task's own objects only."""
 
 MIN_WORDS = 3
 MAX_WORDS_AND_MARKS, MAX_CHARACTERS = 38, 172
 """SmolVLA and pi0 keep the first 48 tokens of an instruction and cut the rest without a warning.
 
-Two of the 48 are not free: pi0's tokenizer puts a token at the beginning, and both policies a line break at the end.
-Their tokenizers could not be had, so three public ones were measured on the bank: GPT-2's, Mistral's and its successor.
-By none has a rewrite more than 8 tokens beyond its words and marks, hence 46 - 8; the longest has 43 of the 46. The
-bound on characters is for sentences with more rare words than the bank's.
+Two of the 48 are not free: pi0's tokenizer adds a token at the beginning, and both policies add a line break at the
+end. Their tokenizers were not available, so three public ones were measured on the bank: GPT-2's, Mistral's and its
+successor. No rewrite has more than 8 tokens beyond its words and marks in any of them, hence 46 - 8. The longest has 43
+of the 46. The bound on characters is for sentences with more rare words than the bank's.
 """
 LENGTH = (
     f"at least {MIN_WORDS} words, at most {MAX_WORDS_AND_MARKS} words and punctuation marks together, "
@@ -40,12 +42,12 @@ _WELL_FORMED = re.compile(r"[a-z]+(?:[,.?!;:]? [a-z]+|['-][a-z]+)*")
 
 
 def normalise(text: str) -> str:
-    """``text`` without case, punctuation and repeated white space: what two wordings are compared by."""
+    """Remove case, punctuation and repeated white space from ``text``; wordings are compared in this form."""
     return " ".join(re.sub(r"[^a-z0-9]+", " ", text.lower().replace("'", "")).split())
 
 
 def too_long(instruction: str) -> str | None:
-    """A warning for an instruction that SmolVLA and pi0 may cut; ``None`` for a shorter one."""
+    """Return a warning if SmolVLA and pi0 may cut the instruction, else ``None``."""
     words_and_marks = len(instruction.split()) + len(_MARK.findall(instruction.lower()))
     if words_and_marks <= MAX_WORDS_AND_MARKS and len(instruction) <= MAX_CHARACTERS:
         return None
@@ -57,7 +59,7 @@ def too_long(instruction: str) -> str | None:
 
 
 def lint(text: str, task: Task, component: Component) -> str | None:
-    """The reason why ``text`` cannot replace the task's instruction; None when it can.
+    """Return why ``text`` cannot replace the task's instruction, or ``None`` if it can.
 
     Raises:
         PipelineError: when the task's BDDL file cannot be read.

@@ -1,4 +1,4 @@
-"""Layout, confounding objects: things that the task is not about stand on the working surface. Physics layer."""
+"""Layout, confounding objects: things that the task does not need stand on the working surface. Physics layer."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 SHELF = 13
-"""How many models the objects of one scene are drawn from: as many as LIBERO-Plus draws from."""
+"""Number of models that the objects of one scene are sampled from, as in LIBERO-Plus."""
 
 
 class AddedObject(Frozen):
-    """An object of ``pipeline.catalogue.objects``, by name and content.
+    """Object of ``pipeline.catalogue.objects``, by name and content.
 
     Attributes:
-        licence, attribution: what it may be shown under and who made it, so that they go where the data goes.
+        licence, attribution: licence and author of the object, stored so that they accompany the data.
     """
 
     name: str
@@ -38,6 +38,7 @@ class AddedObject(Frozen):
 
     @classmethod
     def of(cls, model: ObjectModel) -> AddedObject:
+        """Record a model of the catalogue."""
         return cls(**{field: getattr(model, field) for field in cls.model_fields})
 
 
@@ -45,8 +46,8 @@ class LayoutPerturbation(PhysicsPerturbation):
     """Objects added to the scene.
 
     Attributes:
-        objects: which; as many as the level.
-        seed: keys the places that are tried for them. Where they end is in the trajectory's ``resolved``.
+        objects: added objects; their number is the level.
+        seed: key of the candidate places. The trajectory's ``resolved`` has the final places.
     """
 
     axis: Literal["layout"] = "layout"
@@ -58,32 +59,43 @@ class LayoutPerturbation(PhysicsPerturbation):
     clearance: ClassVar[float] = 1.0
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        # Drawing a plan must not load the simulator.
+        """Return the scene with the objects added; see ``pipeline.scenes.placement.place``."""
+        # Sampling a plan must not load the simulator.
         from pipeline.scenes.placement import place
 
-        return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed, roll_out)
+        models = [find(added.name, added.sha256) for added in self.objects]
+        return place(scene, demo, models, self.seed, roll_out)
 
     def named_in(self, instruction: str) -> bool:
-        """Whether the instruction has a word for an added object, or for one that looks alike."""
+        """Return whether the instruction has a word for an added object, or for an object that looks like one."""
         words = words_in(instruction)
         return any(nouns_of(added.category) & words for added in self.objects)
 
     same: ClassVar[Same | None] = "scene"
 
     def distances_on(self, test: TestSet, task: Task) -> list[float]:
-        """By category: infinite where a test task in this scene adds nothing of the same category.
+        """Return infinity for each test task in this scene that shares no category with the added objects, else 0.
 
         The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
         """
-        return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout", "scene")]
+        tested = test.on(task, "layout", "scene")
+        return [self._apart_from(_plain(test_task.parameters["category"])) for test_task in tested]
 
     def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:
-        return np.array([self._apart_from(added.category for added in other.objects) for other in others])
+        """Return infinity for each perturbation that shares no category with this one, else 0 (N,)."""
+        return np.array([self._apart_from(perturbation._categories) for perturbation in others])
+
+    @property
+    def _categories(self) -> set[str]:
+        """Categories of the added objects."""
+        return {added.category for added in self.objects}
 
     def _apart_from(self, categories: Iterable[str]) -> float:
-        return math.inf if {added.category for added in self.objects}.isdisjoint(categories) else 0.0
+        """Return infinity if no added object has one of ``categories``, else 0."""
+        return math.inf if self._categories.isdisjoint(categories) else 0.0
 
     def credits(self) -> frozenset[Credit]:
+        """List the added objects with their licences."""
         return frozenset(Credit(o.name, "object", o.licence, o.attribution) for o in self.objects)
 
 
@@ -109,7 +121,7 @@ class LayoutAxis(Axis):
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
-        """By the number of added objects."""
+        """Return the level, which is the number of added objects."""
         return int(tested.parameters["count"])
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LayoutPerturbation:
@@ -117,8 +129,9 @@ class LayoutAxis(Axis):
         fitting = _fitting(self.sources, task)
         shelf: dict[str, ObjectModel] = {}
         for index in rng.permutation(len(fitting)):
-            if fitting[index].shape.footprint_m2 <= self.area_m2 / level and len(shelf) < SHELF:
-                shelf.setdefault(fitting[index].category, fitting[index])
+            model = fitting[index]
+            if model.shape.footprint_m2 <= self.area_m2 / level and len(shelf) < SHELF:
+                shelf.setdefault(model.category, model)
         if len(shelf) < level:
             raise PipelineError(
                 f"{len(shelf)} categories of objects go with {task}, {level} are wanted",
@@ -130,17 +143,20 @@ class LayoutAxis(Axis):
         return LayoutPerturbation(level=level, objects=objects, seed=int(rng.integers(2**31)))
 
     def offered(self) -> dict[str, int]:
-        found = models(self.sources).values()
-        return {"models": len({one.sha256 for one in found}), "categories": len({one.category for one in found})}
+        """Count the distinct models and categories of ``sources``."""
+        listed = models(self.sources).values()
+        hashes = {model.sha256 for model in listed}
+        categories = {model.category for model in listed}
+        return {"models": len(hashes), "categories": len(categories)}
 
 
 @cache
 def _fitting(sources: tuple[Source, ...], task: Task) -> list[ObjectModel]:
-    """The objects that are of another category than everything in a task's scene."""
-    there = taken(task)
-    return [model for model in models(sources).values() if goes_with(model, there)]
+    """List the objects whose category differs from all categories in a task's scene."""
+    in_scene = taken(task)
+    return [model for model in models(sources).values() if goes_with(model, in_scene)]
 
 
 def _plain(categories: object) -> list[str]:
-    """Category names without the number that some of LIBERO-Plus's end in."""
+    """List category names without the number at the end of some names of LIBERO-Plus."""
     return [name.rpartition("__")[0] or name for name in str(categories).split(",")]

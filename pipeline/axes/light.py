@@ -1,8 +1,8 @@
 """Light: colour, direction, gloss and shadows of the scene's lamps. Render layer; both views change.
 
-Every lamp of the model changes in the same way (the kitchen has three, the other arenas two), relative to what it is
-in the scene, and stays where it is. The head light that MuJoCo fixes to each camera stays too, so no draw makes a frame
-black. What is known of LIBERO-Plus's light, and what is not, is in docs/axes.md.
+All lamps of the model get one change, relative to their values in the scene, and keep their places. The kitchen has
+three lamps, the other arenas have two. The head light that MuJoCo fixes to each camera stays too, so no perturbation
+makes a frame black. docs/axes.md states the known and the unknown properties of LIBERO-Plus's light.
 """
 
 from __future__ import annotations
@@ -26,38 +26,47 @@ Component = Literal["diffuse", "direction", "specular", "shadows", "combined"]
 Multiple = Annotated[float, Field(ge=0.0, le=100.0)]
 
 SHADOWED_DIFFUSE, SHADOWED_SPECULAR = 0.7, 0.5
-"""Most light that lamps with shadows may add up to. Without shadows all lamps are rendered in one pass, which cuts
-their sum off at the colour of what they shine on; with shadows each has a pass of its own, nothing is cut off, and the
-kitchen's three lamps of 0.8 each would make its table white."""
+"""Largest sum of the light of lamps with shadows.
+
+Without shadows all lamps are rendered in one pass, which cuts their sum off at the colour of the lit surface. With
+shadows each lamp has its own pass and nothing is cut off. The kitchen's three lamps of 0.8 each would then make its
+table white."""
 
 SHOWN_DIFFUSE = 0.8
-"""Most light that lamps add up to once they are changed: that of one lamp of LIBERO's. Its kitchen has a directional
-lamp beside its two, and of their sum a half could go without a trace, because the sum is cut off all the same."""
+"""Largest sum of the light of changed lamps: the light of one of LIBERO's lamps.
+
+LIBERO's kitchen has a directional lamp in addition to its two other lamps. Half of their sum could vanish without a
+trace, because the sum is cut off anyway."""
 
 FLOOR_SHININESS = 0.1
-"""Of LIBERO's floors, which have no gloss, once they have: at 0, a highlight would be spread over all of the floor."""
+"""Shininess of LIBERO's floors once they have gloss; their own 0 would spread a highlight over the whole floor."""
 
 TILT_AZIMUTH_DEG = ((135.0, 270.0),)
-"""Towards where lamps are turned. LIBERO's two stand at (1, 1, 4) and (-3, -3, 4) m and light 45 degrees about where
-they point: the first lights the scene, the second misses it. Turned by 20 degrees to the other side, from 315 to 90,
-they leave much of the scene to the head light: of their shadows nothing shows, and of their colour little."""
+"""Directions towards which lamps are turned.
+
+LIBERO's two lamps stand at (1, 1, 4) and (-3, -3, 4) m and light 45 degrees about their direction. The first lights the
+scene, the second misses it. Turned by 20 degrees to the other side, from 315 to 90 degrees, they leave much of the
+scene to the head light. Then their shadows do not show, and their colour hardly does."""
 
 DARK_LEVEL, DARK_SHARE = 10, 0.6
 BRIGHT_LEVEL, BRIGHT_SHARE = 250, 0.25
-"""A frame is too dark or blown out where more than a share of its pixels have no channel above, or below, a level."""
+"""Grey levels and shares of pixels by which ``exposure`` rejects a frame.
+
+A frame is too dark if more than ``DARK_SHARE`` of its pixels have no channel above ``DARK_LEVEL``. It is blown out if
+more than ``BRIGHT_SHARE`` of its pixels have no channel below ``BRIGHT_LEVEL``."""
 
 
 class LightPerturbation(RenderPerturbation):
     """Changed lamps.
 
     Attributes:
-        diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel. Before, lamps that add up to more than
-            ``SHOWN_DIFFUSE``, the kitchen's, are dimmed to it, whatever else is drawn; it changes 12 % of their pixels
-            by 8 grey levels or more.
+        diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel. Lamps that add up to more than
+            ``SHOWN_DIFFUSE``, as the kitchen's do, are always dimmed to it first. This changes 12 % of the kitchen's
+            pixels by 8 grey levels or more.
         specular_scale: multiple of each lamp's specular colour; above 1 it polishes the surfaces too.
-        tilt_deg: every lamp is turned in place by so much,
-        tilt_azimuth_deg: towards this horizontal direction (0 is the world's x axis, 90 its y axis).
-        shadows: whether lamps cast shadows.
+        tilt_deg: angle by which every lamp is turned in place.
+        tilt_azimuth_deg: horizontal direction of this turn (0 is the world's x axis, 90 its y axis).
+        shadows: true if lamps cast shadows.
         fill_scale: share of the lamps' diffuse light that reaches into shadows.
     """
 
@@ -83,7 +92,7 @@ class LightPerturbation(RenderPerturbation):
         model.light_specular *= self.specular_scale
         if self.tilt_deg:
             azimuth = np.deg2rad(self.tilt_azimuth_deg)
-            # Turning what points down about this axis takes it towards the azimuth.
+            # A turn about this axis takes a direction that points down towards the azimuth.
             across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
             model.light_dir[:] = model.light_dir @ _rotation(across, self.tilt_deg).T
         if self.shadows:
@@ -91,12 +100,12 @@ class LightPerturbation(RenderPerturbation):
             _limit(model.light_diffuse, model.light_directional, SHADOWED_DIFFUSE)
             _limit(model.light_specular, model.light_directional, SHADOWED_SPECULAR)
             model.light_diffuse *= 1 - self.fill_scale
-            # In MuJoCo a lamp's ambient light stops at shadows, the emission of a surface does not. A third of what
-            # is taken from the lamps: with more, walls outshine the table, with less, all darkens.
+            # In MuJoCo a lamp's ambient light stops at shadows, the emission of a surface does not. The emission is a
+            # third of the light taken from the lamps: with more, walls outshine the table, with less, all darkens.
             model.mat_emission += self.fill_scale * SHADOWED_DIFFUSE / 3
         if self.specular_scale > 1:
-            # What a surface reflects as a highlight it does not scatter. The root brings 2 to 30 to 0.9 to 0.6.
-            # This comes after the limits: else a bright lamp with shadows would be as bright as without gloss.
+            # A surface does not scatter the light of its highlights. The root maps scales 2 to 30 to 0.9 to 0.6.
+            # This step follows the limits: else a bright lamp with shadows would be as bright as without gloss.
             scattered = self.specular_scale ** (-1 / 6)
             model.light_diffuse *= scattered
             model.mat_shininess[model.mat_specular == 0] = FLOOR_SHININESS
@@ -123,8 +132,9 @@ class LightRange(Frozen):
 
 
 def _range(dim: tuple[float, float], bright: tuple[float, float], *others: tuple[float, float]) -> LightRange:
-    """Others are one interval for each of the other fields, in their order."""
-    intervals = [(dim, bright), *((interval,) for interval in others)]
+    """Build a range from two intervals of ``brightness_scale`` and one interval of each other field, in their order."""
+    intervals: list[tuple[tuple[float, float], ...]] = [(dim, bright)]
+    intervals += [(interval,) for interval in others]
     return LightRange.model_validate(dict(zip(LightRange.model_fields, intervals, strict=True)))
 
 
@@ -162,19 +172,25 @@ class LightAxis(Axis):
         }
         drawn: dict[str, object] = {}
         names = properties.get(component, (component,))
-        # These are as bright as can be already: the kitchen's lamps, and those whose shadows are to show.
+        # The kitchen's lamps and lamps with shadows already have their largest brightness.
         brightest = "shadows" in names or bddl.read(task.bddl_file).arena == "kitchen"
         for name in names:
             drawn |= self._draw(rng, name, level, brightest)
         return LightPerturbation.model_validate({"component": component, "level": level, **drawn})
 
     def _draw_component(self, rng: np.random.Generator) -> Component:
+        """Sample ``combined`` with probability ``combined_share``, else one of the other components."""
         single = [component for component in self.components if component != "combined"]
         if "combined" in self.components and (not single or rng.random() < self.combined_share):
             return "combined"
         return single[rng.integers(len(single))]
 
     def _draw(self, rng: np.random.Generator, component: str, level: Level, brightest: bool) -> dict[str, object]:
+        """Sample the parameters of one property at a level.
+
+        Args:
+            brightest: true if the lamps must not become brighter.
+        """
         ranges = self.ranges[level - 1]
         match component:
             case "diffuse":
@@ -195,11 +211,10 @@ class LightAxis(Axis):
 
 
 def exposure(frame: Frame) -> str | None:
-    """Why a clean frame (H, W, 3) shows too little to learn from; None when it shows enough.
+    """Return why a clean frame (H, W, 3) shows too little to learn from, or ``None`` if it shows enough.
 
-    ``too_dark`` when more than 60 % of its pixels have no channel above 10, ``blown_out`` when more than 25 % have
-    no channel below 250. LIBERO's own first frames, both views in all
-    arenas, have at most 11 % and 1 % of these.
+    ``too_dark``: more than 60 % of the pixels have no channel above 10. ``blown_out``: more than 25 % have no channel
+    below 250. LIBERO's own first frames, both views in all arenas, have at most 11 % and 1 % of such pixels.
     """
     if (frame.max(axis=2) <= DARK_LEVEL).mean() > DARK_SHARE:
         return "too_dark"
@@ -209,15 +224,15 @@ def exposure(frame: Frame) -> str | None:
 
 
 def _limit(colours: NDArray[np.float32], directional: NDArray[np.bool_], most: float) -> None:
-    """Dim lamps (N, 3) in place, all by the same factor, until what falls on any one spot is at most ``most``."""
+    """Dim lamps (N, 3) in place by one factor, until every spot receives at most ``most`` light."""
     strength, everywhere = colours.max(1), np.asarray(directional, bool)
-    # A spot light reaches its own part of the room, a directional one all of it.
+    # A spot light reaches its own part of the room, a directional light the whole room.
     total = strength[everywhere].sum() + strength[~everywhere].max(initial=0.0)
     colours *= most / max(total, most)
 
 
 def _rotation(axis: NDArray[np.float64], angle_deg: float) -> NDArray[np.float64]:
-    """(3, 3) right-handed rotation about a unit axis."""
+    """Return the matrix (3, 3) of a right-handed rotation about a unit axis."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.deg2rad(angle_deg)

@@ -1,4 +1,4 @@
-"""Sensor noise on the agent view: five image corruptions, a fresh draw for every frame."""
+"""Sensor noise on the agent view: five image corruptions, sampled again for every frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from pipeline.testset.definitions import Value
 from pipeline.types import Floats, Frame, Task
 
 Effect = Motion | Gaussian | Zoom | Fog | Glass
-"""Their ``strength`` names the parameter that grows with the severity, and gives its value for a clean frame."""
+"""Corruptions. ``strength`` is the name of the parameter that grows with the severity, and its value in a clean frame.
+"""
 E = TypeVar("E", Motion, Gaussian, Zoom, Fog, Glass)
 
 
@@ -30,8 +31,8 @@ class NoisePerturbation(PixelPerturbation):
 
     Attributes:
         effect: the corruption and its parameters.
-        level: the row of the axis's grid that ``effect`` is.
-        seed: with the index of the frame, the key of everything drawn in :meth:`apply`.
+        level: row of ``effect`` in the axis's grid.
+        seed: with the index of the frame, the key of all random numbers in :meth:`apply`.
     """
 
     axis: Literal["noise"] = "noise"
@@ -46,37 +47,47 @@ class NoisePerturbation(PixelPerturbation):
 
     @model_validator(mode="after")
     def _component_is_that_of_effect(self) -> NoisePerturbation:
+        """Check that ``component`` is the effect's component."""
         if self.component != self.effect.component:
             raise ValueError(f"component is {self.component!r}, but the effect's parameters are {self.effect!r}")
         return self
 
     def apply(self, frame: Frame, frame_index: int) -> Frame:
-        """A corrupted copy of one frame.
+        """Return a corrupted copy of one frame.
 
         Args:
-            frame: (H, W, 3) RGB in the raw orientation of the simulator, *before* the rotation by 180 degrees:
-                there the benchmark corrupts, and motion, fog and glass are not symmetric under that rotation.
-            frame_index: place of the frame in its episode; each index has draws of its own.
+            frame: (H, W, 3) RGB in the raw orientation of the simulator, *before* the rotation by 180 degrees. The
+                benchmark corrupts at this point, and motion, fog and glass are not symmetric under the rotation.
+            frame_index: index of the frame in its episode; each index has random numbers of its own.
         """
         return self.effect.apply(frame, seeding.rng(self.seed, "noise", frame_index))
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """To the test severities of the same component, whatever their task: 0.5 is half way to the next.
+        """Return the distances to the component's test severities of all tasks: 0.5 is half way to the next severity.
 
-        The clearance keeps to the middle half between two severities. The parameters that do not set the strength
-        are not compared, so an equal strength counts as equal.
+        The clearance allows the middle half between two severities. Parameters that do not set the strength are not
+        compared, so an equal strength counts as equal.
         """
         tested, severities = _tested(test, self.component, self.effect.strength[0])
         return np.abs(severities - self.severity(test)) if tested else severities
 
     def apart(self, others: Sequence[NoisePerturbation]) -> Floats:
-        """To the strengths of the same component, on the scale of the benchmark's severities."""
+        """Return the distances (N,) to perturbations of this component, on the scale of the benchmark's severities.
+
+        A distance is NaN if the component differs.
+        """
         test = benchmark.load()
-        severities = [other.severity(test) if other.component == self.component else np.nan for other in others]
+        severities = []
+        for perturbation in others:
+            comparable = perturbation.component == self.component
+            severities.append(perturbation.severity(test) if comparable else np.nan)
         return np.abs(np.array(severities) - self.severity(test))
 
     def severity(self, test: TestSet) -> float:
-        """The strength on the scale of the component's test severities, 0 where nothing changes; NaN without any."""
+        """Return the strength on the scale of the component's test severities.
+
+        It is 0 for a clean frame, and NaN if the component has no test tasks.
+        """
         name, clean = self.effect.strength
         tested, _ = _tested(test, self.component, name)
         if not tested:
@@ -90,8 +101,12 @@ class NoisePerturbation(PixelPerturbation):
 
 @cache
 def _tested(test: TestSet, component: Component, name: str) -> tuple[tuple[float, ...], Floats]:
-    """The values of a parameter among a component's test tasks, ascending, and each test task's place among them,
-    counted from 1: NaN for those of other components."""
+    """Collect the values of a parameter in a component's test tasks.
+
+    Returns:
+        The distinct values, ascending. The place of each noise task's value among them (N,), counted from 1; NaN for
+        test tasks of other components.
+    """
     values = [float(t.parameters[name]) if t.component == component else np.nan for t in test.of("noise")]
     ascending = sorted({value for value in values if not np.isnan(value)})
     places = [np.nan if np.isnan(value) else 1.0 + ascending.index(value) for value in values]
@@ -99,10 +114,10 @@ def _tested(test: TestSet, component: Component, name: str) -> tuple[tuple[float
 
 
 def _grid(effect: type[E], **parameters: ByLevel[float]) -> ByLevel[E]:
-    """An effect at five levels, from one column of values per parameter."""
-    rows = zip(*parameters.values(), strict=True)
-    one, two, three, four, five = (effect(**dict(zip(parameters, row, strict=True))) for row in rows)
-    return one, two, three, four, five
+    """Build an effect at five levels from one column of values per parameter."""
+    effects = [effect(**dict(zip(parameters, row, strict=True))) for row in zip(*parameters.values(), strict=True)]
+    first, second, third, fourth, fifth = effects
+    return first, second, third, fourth, fifth
 
 
 class NoiseAxis(Axis):
@@ -120,33 +135,35 @@ class NoiseAxis(Axis):
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
-        """By the severity; two make one level."""
+        """Return the level by the severity; two severities make one level."""
         return level_from(float(tested.parameters["severity"]) / 2)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
-        """A component and a level, each with equal chance, whatever the task and the place."""
+        """Sample a component and a level, each with equal probability, independent of ``task`` and ``place``."""
         grid = pick(rng, self._grids)
         level = self.draw_level(rng)
         effect = grid[level - 1]
-        seed = int(rng.integers(2**53))  # what every JSON reader keeps exactly
+        seed = int(rng.integers(2**53))  # every JSON reader keeps such an integer exactly
         return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=seed)
 
     @property
     def _grids(self) -> tuple[ByLevel[Effect], ...]:
+        """Grids of all components."""
         return self.motion, self.gaussian, self.zoom, self.fog, self.glass
 
     def refuse_tested(self, test: TestSet, task: Task) -> None:
-        """Refuse a row that is too near to a severity of the benchmark: a level has no other draw.
+        """Reject a row that is too near to a severity of the benchmark, because its level has no other perturbation.
 
         Raises:
             PipelineError: naming component and levels.
         """
         for grid in self._grids:
-            rows = [
-                NoisePerturbation(component=grid[level - 1].component, effect=grid[level - 1], level=level, seed=0)
-                for level in sorted({*self.levels})
-            ]
-            near = [row.level for row in rows if row.nearest(test, task).distance < row.clearance]
+            near = []
+            for level in sorted({*self.levels}):
+                effect = grid[level - 1]
+                row = NoisePerturbation(component=effect.component, effect=effect, level=level, seed=0)
+                if row.nearest(test, task).distance < row.clearance:
+                    near.append(level)
             if near:
                 component, (name, _) = grid[0].component, grid[0].strength
                 tested = ", ".join(f"{value:g}" for value in _tested(test, component, name)[0])
@@ -159,19 +176,19 @@ class NoiseAxis(Axis):
 
     @classmethod
     def held_out(cls) -> NoiseAxis:
-        """The strengths of the benchmark's even severities.
+        """Return the strengths of the benchmark's even severities.
 
-        Noise has one strength for each component and level. With the default ones, held-out perturbations would be as
-        strong as those that plans train on; from the benchmark's, plans keep clear.
+        Noise has one strength for each component and level. With the default strengths, held-out perturbations would
+        equal the perturbations of plans. Plans keep their clearance to the benchmark's strengths.
         """
         tests = benchmark.load().of("noise")
         effects = {(test.component, test.parameters["severity"]): effect_of(test) for test in tests}
-        components = dict.fromkeys(test.component for test in tests)
-        return cls.model_validate(
-            {component: tuple(effects[component, 2 * level] for level in LEVELS) for component in components}
-        )
+        grids = {}
+        for component in dict.fromkeys(test.component for test in tests):
+            grids[component] = tuple(effects[component, 2 * level] for level in LEVELS)
+        return cls.model_validate(grids)
 
 
 def effect_of(test: TestTask) -> dict[str, Value]:
-    """The parameters of a noise task's corruption."""
+    """Return the parameters of a noise task's corruption."""
     return {name: value for name, value in test.parameters.items() if name != "severity"}

@@ -1,4 +1,4 @@
-"""Robot: the posture that the arm starts in or is pulled to. Physics layer."""
+"""Robot: posture in which the arm starts, or to which the controller pulls it. Physics layer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Joints = tuple[float, float, float, float, float, float, float]
 Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
 
 LIMIT_MARGIN_RAD = 0.05
-"""How far from its limits every joint must start."""
+"""Least distance of every joint's start from the joint's limits."""
 
 Component = Literal["initial_joints", "controller_posture"]
 
@@ -29,17 +29,18 @@ Component = Literal["initial_joints", "controller_posture"]
 class RobotPerturbation(PhysicsPerturbation):
     """A posture away from where the demonstration starts.
 
-    ``initial_joints`` puts the arm there, and the controller holds it there. ``controller_posture`` does what
-    LIBERO-Plus's robot tasks do: there the reset has another posture, and then the recorded state is put in. So the arm
-    starts where it was recorded, and the controller pulls it, while the scene settles and all through the episode, to
-    the posture by its null space, and to the posture's hand orientation until an action turns the hand.
+    ``initial_joints`` puts the arm into the posture, and the controller holds it there. ``controller_posture`` copies
+    LIBERO-Plus's robot tasks, in which the reset has another posture and the recorded state is restored afterwards. The
+    arm then starts where it was recorded. While the scene settles and during the episode, the controller pulls the arm
+    to the posture in its null space. Until an action turns the hand, it also pulls the hand to the posture's
+    orientation.
 
-    The offset is added to the same of the clean twin: ``initial_joints`` to the recorded start, which LIBERO's reset
-    scattered by 0.02 to 0.10 rad about home, ``controller_posture`` to the posture of the reset. Only so is the change
-    as large as its level says, and no offset the clean twin.
+    The offset is added to a posture of the clean twin. For ``initial_joints`` this is the recorded start, which
+    LIBERO's reset scattered by 0.02 to 0.10 rad about home. For ``controller_posture`` it is the posture of the reset.
+    Only then is the change as large as its level states, and an offset of zero the clean twin.
 
     Attributes:
-        joint_offsets_rad: base to wrist.
+        joint_offsets_rad: offsets of the joints, from base to wrist.
     """
 
     axis: Literal["robot"] = "robot"
@@ -52,12 +53,12 @@ class RobotPerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "the norm of the difference between the joint offsets"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene with the arm turned and at rest, or with the controller's posture; all else stays as it is.
+        """Return the scene with the arm turned and at rest, or with the controller's posture, otherwise unchanged.
 
         Raises:
-            RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot
-                is put where it touches what it did not touch before, ``test_posture`` when recorded start and offset
-                happen to add up to a posture of the test set.
+            RefusedError: ``joint_limit``: a joint comes too near its limit.
+                ``robot_in_collision``: the robot touches a thing that it did not touch before.
+                ``test_posture``: recorded start and offset happen to add up to a posture of the test set.
         """
         from pipeline.scenes.compiled import ARM, CompiledScene
 
@@ -81,38 +82,43 @@ class RobotPerturbation(PhysicsPerturbation):
             from scipy.spatial.transform import Rotation  # takes long, and every process of a run imports the axes
 
             hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
-            drawn_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
-            return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": drawn_to})
+            pulled_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
+            return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": pulled_to})
         if compiled.touching().keys() - before:
             raise RefusedError("robot_in_collision")
         resolved = {**scene.resolved, "robot": {"joints_rad": posture.tolist()}}
         return replace(scene, state=state, posture_rad=None, resolved=resolved)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """To the offsets of all robot tasks; the arm is the same in all, so ``task`` does not matter."""
-        return self._apart_rad(benchmark_offsets_rad())[[int(one.parameters["id"]) - 1 for one in test.of("robot")]]
+        """Return the distances (N,) to the offsets of all robot tasks; all tasks share one arm."""
+        rows = [int(tested.parameters["id"]) - 1 for tested in test.of("robot")]
+        return self._apart_rad(benchmark_offsets_rad())[rows]
 
     def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
-        """To the offsets of all, as the arm is the same in all tasks."""
-        return self._apart_rad([other.joint_offsets_rad for other in others])
+        """Return the distances (N,) to the offsets of N perturbations of any task; all tasks share one arm."""
+        return self._apart_rad([perturbation.joint_offsets_rad for perturbation in others])
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450; the arm is the same in all
-        tasks, so ``task`` does not matter."""
+        """Return the distance to the nearest of the benchmark's 500 offsets, of which its robot tasks use 450.
+
+        All tasks share one arm, so the distance does not depend on ``task``.
+        """
         compared = len(test.of("robot"))
-        return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()) if compared else np.inf, compared)
+        if not compared:
+            return Nearest(np.inf, compared)
+        return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()), compared)
 
     def _apart_rad(self, offsets_rad: ArrayLike) -> Floats:
-        """(N,) from offsets (N, 7)."""
+        """Return the distances (N,) to offsets (N, 7)."""
         return np.asarray(np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1))
 
 
 @cache
 def benchmark_offsets_rad() -> Floats:
-    """(500, 7) the benchmark's offsets, row ``id - 1``: 100 random directions at each norm from 0.1 to 0.5 rad.
+    """Return the benchmark's offsets (500, 7), in row ``id - 1``: 100 random directions at each norm, 0.1 to 0.5 rad.
 
-    Reproduces the tables of LIBERO-Plus's ``MountedPanda<id>`` and ``OnTheGroundPanda<id>`` classes, which were made
-    with NumPy's legacy generator, to 1e-8 rad.
+    They reproduce the tables of LIBERO-Plus's ``MountedPanda<id>`` and ``OnTheGroundPanda<id>`` classes, which were
+    generated with NumPy's legacy generator, to 1e-8 rad.
     """
     directions = np.random.RandomState(42).randn(500, 7)
     norms = np.repeat([0.1, 0.2, 0.3, 0.4, 0.5], 100)
@@ -140,7 +146,7 @@ class RobotAxis(Axis):
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
-        """By the norm of the offset, 0.1 rad a level."""
+        """Return the level by the norm of the offset, 0.1 rad for each level."""
         return level_from(float(tested.parameters["id"]) / 100)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:

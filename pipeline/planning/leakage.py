@@ -1,10 +1,11 @@
-"""The report on a plan and the benchmark's test tasks: that it keeps clear of them, and how near it comes to each.
+"""Report on a plan's distances to the benchmark's test tasks: check of the clearance, and coverage of each component.
 
-The two pull against each other: a plan far from all test tasks overlaps with none, and prepares for none. So beside the
-least distance of any pair stands, for each component, how far the test tasks are from what is planned.
+The two conflict: a plan far from all test tasks overlaps with none, and prepares for none. The report therefore states
+the least distance of any pair and, for each component, the distances from the test tasks to the planned episodes.
 
-Every perturbation is read back from the plan as it was recorded and compared anew, whatever the planner thought. A row
-with several counts for each of its axes: the benchmark perturbs one at a time, but each part must keep its clearance.
+Every perturbation is read back from the plan and compared again, independently of the planner. A row with several
+perturbations counts for each of its axes: the benchmark perturbs one axis at a time, but each part must keep its
+clearance.
 """
 
 import math
@@ -32,7 +33,7 @@ from pipeline.types import Floats, Task
 
 @dataclass(frozen=True)
 class Compared:
-    """What of an episode is compared with the test tasks, named as in a row of the plan."""
+    """Fields of an episode that are compared with the test tasks, named as in a row of the plan."""
 
     episode_id: str
     suite: str
@@ -43,12 +44,12 @@ class Compared:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How far the test tasks of one component are from the nearest episode, in the axis's measure.
+    """Distances from the test tasks of one component to the nearest episode, in the axis's measure.
 
     Attributes:
-        test_tasks: the benchmark's tasks of this component.
-        compared: those that some episode could be compared with; 0 where the measure does not tell near from far.
-        smallest, median, p90, largest: of their distances, 90 % are at most ``p90``; None when none was compared.
+        test_tasks: number of the benchmark's tasks of this component.
+        compared: number of test tasks that some episode could be compared with; 0 if the measure has no unit.
+        smallest, median, p90, largest: quantiles of their distances; ``None`` if no test task was compared.
     """
 
     test_tasks: int
@@ -61,24 +62,24 @@ class Coverage:
 
 @dataclass(frozen=True)
 class AxisDistance:
-    """How close a plan comes to the test tasks of one axis.
+    """Distances between a plan and the test tasks of one axis.
 
     Attributes:
-        rows: planned episodes that the axis perturbs, reserves among them.
-        test_tasks: the benchmark's tasks of this axis.
-        comparisons: pairs of an episode and a test task that were compared.
-        not_compared: episodes that could be compared with none of the test tasks, such as those in a scene that none
-            has, or all where what the test tasks change cannot be read offline.
-        smallest: the least distance of all, or of the overlaps where there are any; None when there was nothing to
-            compare with, or nothing similar.
-        closest: the episode it belongs to.
-        clearance: the least distance that is allowed, of this episode's kind where the axis has several.
-        measure: what the distance is and its unit; of each kind.
-        overlaps: episodes that are closer than that.
-        verdict: ``overlap``, ``disjoint``, ``disjoint where compared`` when some episodes were not compared, or
-            ``unknown`` when none was.
-        coverage: component of the test tasks to how far these are from the wanted episodes, reserves left out; the
-            report has it of the kept ones (``covered_by``).
+        rows: number of planned episodes that the axis perturbs, including reserves.
+        test_tasks: number of the benchmark's tasks of this axis.
+        comparisons: number of compared pairs of an episode and a test task.
+        not_compared: number of episodes without a comparable test task, such as episodes in a scene of no test task.
+            It counts all episodes if the changes of the test tasks cannot be read offline.
+        smallest: least distance of all pairs, or of the overlaps if there are any; ``None`` if nothing was compared or
+            nothing was similar.
+        closest: episode with this distance.
+        clearance: least allowed distance, for this episode's kind of perturbation if the axis has several.
+        measure: definition and unit of the distance, for each kind of perturbation.
+        overlaps: number of episodes that are closer than their clearance.
+        verdict: ``overlap``, ``disjoint``, ``disjoint where compared`` if some episodes were not compared, or
+            ``unknown`` if no episode was compared.
+        coverage: component of the test tasks to their distances from the wanted episodes, without reserves; the report
+            has the distances from the kept episodes (``covered_by``).
     """
 
     rows: int
@@ -95,25 +96,33 @@ class AxisDistance:
 
 
 def check(rows: Sequence[Row | Compared], test: TestSet) -> dict[str, AxisDistance]:
-    """Axis to finding, in the order of the plan."""
-    found: dict[str, list[tuple[Nearest, str, Perturbation]]] = defaultdict(list)
+    """Compare every perturbation of a plan with the test tasks.
+
+    Returns:
+        Axis to its finding, in the order of the plan.
+    """
+    compared: dict[str, list[tuple[Nearest, str, Perturbation]]] = defaultdict(list)
     wanted: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
-    tasks = {key: find_task(*key) for key in {(row.suite, row.task) for row in rows}}
+    names = {(row.suite, row.task) for row in rows}
+    tasks = {(suite, name): find_task(suite, name) for suite, name in names}
     for row in rows:
         task = tasks[row.suite, row.task]
         for perturbation in from_json(row.perturbations):
-            found[perturbation.axis].append((perturbation.nearest(test, task), row.episode_id, perturbation))
+            compared[perturbation.axis].append((perturbation.nearest(test, task), row.episode_id, perturbation))
             if row.wanted:
                 wanted[perturbation.axis].append((perturbation, task))
-    return {
-        axis: _finding(of_axis, len(test.of(axis)), coverage(axis, distances(axis, wanted[axis], test), test))
-        for axis, of_axis in found.items()
-    }
+    findings = {}
+    for axis, comparisons in compared.items():
+        least = distances(axis, wanted[axis], test)
+        findings[axis] = _finding(comparisons, len(test.of(axis)), coverage(axis, least, test))
+    return findings
 
 
 def distances(axis: str, draws: Iterable[tuple[Perturbation, Task]], test: TestSet) -> Floats:
-    """(N,) how far each of an axis's test tasks is from the nearest of some draws on the axis, NaN where it cannot be
-    compared with any, or the axis's measure does not tell near from far."""
+    """Return the distance (N,) from each of an axis's test tasks to the nearest of some perturbations on the axis.
+
+    It is NaN if the test task cannot be compared with any of them, or if the axis's measure has no unit.
+    """
     least = np.full(len(test.of(axis)), np.nan)
     for perturbation, task in draws:
         if perturbation.unit is not None:
@@ -122,7 +131,7 @@ def distances(axis: str, draws: Iterable[tuple[Perturbation, Task]], test: TestS
 
 
 def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
-    """What :func:`distances` come to for each component of the axis's test tasks."""
+    """Summarize the result of :func:`distances` for each component of the axis's test tasks."""
     components = np.array([tested.component for tested in test.of(axis)])
     summaries = {}
     for component in dict.fromkeys(components.tolist()):
@@ -136,10 +145,11 @@ def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
 def covered_by(
     kept: Iterable[Mapping[str, Any]], findings: Mapping[str, Mapping[str, Any]], test: TestSet
 ) -> dict[str, dict[str, Any]]:
-    """The findings of ``leakage.json`` with the coverage of kept episodes in place of the planned ones'.
+    """Replace the planned episodes' coverage in the findings of ``leakage.json`` by the kept episodes' coverage.
 
     Args:
         kept: rows of the manifest.
+        findings: content of ``leakage.json``.
     """
     draws: dict[str, list[tuple[Perturbation, Task]]] = {axis: [] for axis in findings}
     for row in kept:
@@ -149,44 +159,64 @@ def covered_by(
     covered = {}
     for axis, finding in findings.items():
         components = coverage(axis, distances(axis, draws[axis], test), test)
-        covered[axis] = {**finding, "coverage": {name: asdict(figures) for name, figures in components.items()}}
+        figures = {name: asdict(figures_of_component) for name, figures_of_component in components.items()}
+        covered[axis] = {**finding, "coverage": figures}
     return covered
 
 
 def _finding(
-    found: Sequence[tuple[Nearest, str, Perturbation]], test_tasks: int, coverage: dict[str, Coverage]
+    comparisons: Sequence[tuple[Nearest, str, Perturbation]], test_tasks: int, coverage: dict[str, Coverage]
 ) -> AxisDistance:
-    nearest, closest, kind = min(found, key=lambda one: (one[0].distance >= one[2].clearance, one[0].distance))
-    not_compared = sum(not one.compared for one, _, _ in found) if test_tasks else 0
-    overlaps = sum(one.distance < kind.clearance for one, _, kind in found)
-    alike = math.isfinite(nearest.distance)
+    """Summarize the comparisons of one axis.
+
+    Args:
+        comparisons: nearest test task, episode id and perturbation of each episode that the axis perturbs.
+    """
+
+    def overlap_first(comparison: tuple[Nearest, str, Perturbation]) -> tuple[bool, float]:
+        nearest, _, perturbation = comparison
+        return nearest.distance >= perturbation.clearance, nearest.distance
+
+    closest, closest_id, closest_perturbation = min(comparisons, key=overlap_first)
+    overlaps = sum(nearest.distance < perturbation.clearance for nearest, _, perturbation in comparisons)
+    not_compared = sum(not nearest.compared for nearest, _, _ in comparisons) if test_tasks else 0
+    alike = math.isfinite(closest.distance)
     if overlaps:
         verdict = "overlap"
-    elif not_compared == len(found):
+    elif not_compared == len(comparisons):
         verdict = "unknown"
     else:
         verdict = "disjoint where compared" if not_compared else "disjoint"
+    measures = dict.fromkeys(_measure(perturbation) for _, _, perturbation in comparisons)
     return AxisDistance(
-        rows=len(found),
+        rows=len(comparisons),
         test_tasks=test_tasks,
-        comparisons=sum(one.compared for one, _, _ in found),
+        comparisons=sum(nearest.compared for nearest, _, _ in comparisons),
         not_compared=not_compared,
-        smallest=nearest.distance if alike else None,
-        closest=closest if alike else None,
-        clearance=kind.clearance,
-        measure="; ".join(dict.fromkeys(f"{f'{k.unit}: ' if k.unit else ''}{k.measure}" for _, _, k in found)),
+        smallest=closest.distance if alike else None,
+        closest=closest_id if alike else None,
+        clearance=closest_perturbation.clearance,
+        measure="; ".join(measures),
         overlaps=overlaps,
         verdict=verdict,
         coverage=coverage,
     )
 
 
+def _measure(perturbation: Perturbation) -> str:
+    """Return the unit, if there is one, and the definition of a perturbation's distance."""
+    if perturbation.unit:
+        return f"{perturbation.unit}: {perturbation.measure}"
+    return perturbation.measure
+
+
 def write(findings: dict[str, AxisDistance], path: Path) -> None:
+    """Write the findings as JSON."""
     write_json(path, {axis: asdict(finding) for axis, finding in findings.items()})
 
 
 def report(findings: dict[str, AxisDistance]) -> Group:
-    """The findings as a person reads them: two tables that fit 80 columns, and what each distance is."""
+    """Format the findings for people: two tables that fit 80 columns, and the definition of each distance."""
     table = Table("axis", title="distance to the LIBERO-Plus test set", box=box.SIMPLE)
     for column in ("episodes", "tests", "overlaps", "smallest", "clearance"):
         table.add_column(column, justify="right")
@@ -200,16 +230,15 @@ def report(findings: dict[str, AxisDistance]) -> Group:
     for column in ("tests", "smallest", "median", "90 %", "largest"):
         covered.add_column(column, justify="right")
     for axis, finding in findings.items():
-        for component, one in finding.coverage.items():
-            figures = (one.smallest, one.median, one.p90, one.largest)
-            shown = ("-" if figure is None else f"{figure:.3g}" for figure in figures)
-            covered.add_row(axis, component, f"{one.test_tasks:,}", *shown)
+        for component, summary in finding.coverage.items():
+            figures = (summary.smallest, summary.median, summary.p90, summary.largest)
+            cells = ["-" if figure is None else f"{figure:.3g}" for figure in figures]
+            covered.add_row(axis, component, f"{summary.test_tasks:,}", *cells)
     lines = [f"{axis}: {finding.measure}" for axis, finding in findings.items()]
-    lines += [
-        f"{axis}: {finding.not_compared:,} of {finding.rows:,} episodes could be compared with no test task"
-        for axis, finding in findings.items()
-        if finding.not_compared
-    ]
+    for axis, finding in findings.items():
+        if finding.not_compared:
+            counts_of_rows = f"{finding.not_compared:,} of {finding.rows:,}"
+            lines.append(f"{axis}: {counts_of_rows} episodes could be compared with no test task")
     return Group(table, covered, *map(Text, lines))
 
 
@@ -217,14 +246,15 @@ def refuse_overlap(findings: dict[str, AxisDistance]) -> None:
     """Stop a run that would train on test tasks.
 
     Raises:
-        PipelineError: when any episode overlaps, naming for each axis how many and the closest.
+        PipelineError: when any episode overlaps, naming for each axis the number of overlaps and the closest one.
     """
-    faults = [
-        f"{finding.overlaps} of {finding.rows} on the {axis} axis (such as {finding.closest}, distance "
-        f"{finding.smallest:.3g}, clearance {finding.clearance:g})"
-        for axis, finding in findings.items()
-        if finding.overlaps
-    ]
+    faults = []
+    for axis, finding in findings.items():
+        if finding.overlaps:
+            faults.append(
+                f"{finding.overlaps} of {finding.rows} on the {axis} axis (such as {finding.closest}, distance "
+                f"{finding.smallest:.3g}, clearance {finding.clearance:g})"
+            )
     if faults:
         raise PipelineError(
             f"planned episodes overlap with the benchmark's test tasks: {'; '.join(faults)}",

@@ -1,4 +1,4 @@
-"""The plan: a table with one row per wanted episode. All randomness is drawn here, keyed, never by position."""
+"""Plan: a table with one row per candidate episode. All random numbers are sampled here, by key, never by position."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -34,12 +34,12 @@ from pipeline.types import Task
 _ATTEMPTS = 100
 
 RESET = "reset"
-"""What stands for the axis where nothing is perturbed and the start is a reset of LIBERO's environment."""
+"""Name in the column ``axis`` of unperturbed episodes that start from a reset of LIBERO's environment."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One candidate episode: the columns of the plan, which are the first of the manifest's, with what they mean."""
+    """Candidate episode: the columns of the plan, which are the first columns of the manifest, with their meanings."""
 
     episode_id: Annotated[str, "hash of demonstration, perturbations and replay settings; joins RLDS, LeRobot and this"]
     twin_id: Annotated[str, "episode of the same demonstration without perturbations; a twin's own id"]
@@ -65,28 +65,30 @@ class Row:
 
     @property
     def reset_seed(self) -> int | None:
-        """Of the reset of LIBERO's environment that the replay starts from; None where it starts as recorded."""
+        """Seed of the reset of LIBERO's environment that starts the replay; ``None`` if it starts as recorded."""
         if self.axis != RESET:
             return None
         return int(rng(self.seed, self.axis, self.demo_id, self.variant).integers(2**32))
 
 
 def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, test: TestSet) -> list[Row]:
-    """Draw the plan: a clean twin of every demonstration, then each axis's or combination's candidates, task by task.
+    """Sample the plan: a clean twin of every demonstration, then each axis's or combination's candidates, task by task.
 
-    A draw that comes closer to one of the benchmark's ``test`` tasks than its axis allows is drawn anew. The benchmark
-    perturbs one axis at a time, but so must each part of a combination keep clear.
+    A perturbation that comes closer to one of the benchmark's ``test`` tasks than its clearance is sampled again. The
+    benchmark perturbs one axis at a time, but each part of a combination must keep its clearance too.
 
     Raises:
-        PipelineError: when there is nothing to plan from for an axis, or a level of it has no draw that keeps clear, or
-            a task of one's own is a test task.
+        PipelineError: when an axis applies to none of the tasks, or a level has no perturbation that keeps its
+            clearance; also when a task of the user's own is a test task.
     """
     by_task = grouped((demo.task, demo) for demo in demos)
     reject_test_tasks(by_task)
-    rows = [row for group in by_task.values() for row in twins(group, plan.seed, replay)]
+    rows: list[Row] = []
+    for group in by_task.values():
+        rows += twins(group, plan.seed, replay)
     for name, episodes in plan.episodes.items():
         draws = Draws(name, plan.drawn_from(name), plan.seed, test)
-        groups = [group for group in by_task.values() if all(axis.applies(group[0].task) for axis in draws.axes)]
+        groups = [group for group in by_task.values() if _all_apply(draws.axes, group[0].task)]
         if not groups:
             raise PipelineError(
                 "none of the chosen tasks has anything that this could change",
@@ -95,11 +97,11 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
             )
         for axis in draws.axes:
             axis.refuse_tested(test, groups[0][0].task)
-        # In an order of its own: or small numbers of all axes would come to the same tasks and demonstrations.
+        # Each axis has its own order. Else small numbers of episodes would use the same tasks on all axes.
         order = sorted(groups, key=lambda group: digest(plan.seed, name, group[0].task.suite, group[0].task.name))
         more = order[: episodes % len(groups)]
         for group in groups:
-            # Dealt out evenly; some tasks get one more where it does not divide.
+            # Episodes are spread evenly; some tasks get one more if the number is not divisible.
             wanted = episodes // len(groups) + (group in more)
             dealt = sorted(group, key=lambda demo: digest(plan.seed, name, demo.demo_id))
             candidates = islice(_candidates(draws, dealt), wanted + ceil(wanted * plan.reserve))
@@ -109,13 +111,25 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     return rows
 
 
+def _all_apply(axes: Sequence[Axis], task: Task) -> bool:
+    """Return whether all axes can change ``task``."""
+    return all(axis.applies(task) for axis in axes)
+
+
 def twins(demos: Sequence[DemoEntry], seed: int, replay: ReplayConfig) -> list[Row]:
-    """The clean twin of each demonstration of a task."""
+    """Return the clean twin of each demonstration of a task."""
     return [replace(_row(demo, (), seed, replay), rank=rank) for rank, demo in enumerate(demos)]
 
 
 def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, replay: ReplayConfig) -> list[Row]:
-    """The clean twin of each demonstration of a task, and candidates that start from resets, each one's in turn."""
+    """Return the clean twin of each demonstration of a task, and candidates that start from resets.
+
+    The demonstrations take turns in providing candidates.
+
+    Args:
+        wanted: number of wanted episodes.
+        reserve: share of further candidates.
+    """
     twins_of_task = twins(demos, seed, replay)
     rows = [*twins_of_task]
     for rank in range(wanted + ceil(wanted * reserve)):
@@ -128,64 +142,80 @@ def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, r
 
 
 def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
-    """Refuse to replay by other settings than those that the ids stand for.
+    """Reject replay settings that differ from the settings in the ids.
 
     Raises:
-        PipelineError: when the plan was drawn under other settings of ``replay``.
+        PipelineError: when the plan was sampled under other settings of ``replay``.
     """
-    if any(row.episode_id != _identity("episode", row.demo_sha256, replay, row.perturbations) for row in rows):
-        raise PipelineError(
-            "the section replay has changed since the plan",
-            remedy=f"`{MAKE_AGAIN}`, which plans again; or put the section back",
-        )
+    for row in rows:
+        if row.episode_id != _identity("episode", row.demo_sha256, replay, row.perturbations):
+            raise PipelineError(
+                "the section replay has changed since the plan",
+                remedy=f"`{MAKE_AGAIN}`, which plans again; or put the section back",
+            )
 
 
 def demonstrations(rows: Sequence[Row]) -> dict[str, int]:
-    """Suite to the number of demonstrations of its task that has most of them; all that have one origin count once."""
+    """Count the demonstrations of the task with most demonstrations, for each suite.
+
+    Demonstrations of one origin count once.
+    """
     most: dict[str, int] = {}
     origins = {(row.suite, row.task, row.demo_origin_sha256) for row in rows if row.role == "twin"}
-    for (suite, _), number in Counter((suite, task) for suite, task, _ in origins).items():
+    per_task = Counter((suite, task) for suite, task, _ in origins)
+    for (suite, _), number in per_task.items():
         most[suite] = max(number, most.get(suite, 0))
     return most
 
 
 def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
-    """Axis or combination to the number of wanted episodes that no different draw was left for, where there are any."""
-    there = Counter(row.axis for row in rows if row.wanted)
-    return {axis: wanted - there[axis] for axis, wanted in plan.episodes.items() if wanted != there[axis]}
+    """Count the wanted episodes that the plan lacks because no different perturbation was left.
+
+    Returns:
+        Axis or combination to the number of missing episodes; axes without missing episodes are left out.
+    """
+    planned = Counter(row.axis for row in rows if row.wanted)
+    return {axis: wanted - planned[axis] for axis, wanted in plan.episodes.items() if wanted != planned[axis]}
 
 
 class Dealt:
-    """How often the candidates of one task have each entry of the lists that its axes take perturbations from.
+    """Counts of the list entries that the candidates of one task have taken, for axes that take entries of lists.
 
-    A candidate takes one of the entries that fewest candidates before it have. Which of these is the choice of its key.
-    So all entries come once before one comes again, and another demonstration changes few of the others' entries.
+    A candidate takes one of the entries that the fewest earlier candidates have; its key decides between them. All
+    entries are therefore used once before any is used again. An additional demonstration changes few entries of the
+    other demonstrations.
     """
 
     def __init__(self) -> None:
+        """Start without any taken entry."""
         self._times: Counter[str] = Counter()
 
     def in_turn(self, entries: Sequence[str], key: str) -> list[int]:
-        """The places of the entries in the order in which a candidate takes them; a single place for an empty list."""
+        """Return the places of the entries in the order in which a candidate tries them; [0] for an empty list."""
         if not entries:
             return [0]
-        return sorted(range(len(entries)), key=lambda place: (self._times[entries[place]], digest(key, entries[place])))
+
+        def rank(place: int) -> tuple[int, str]:
+            entry = entries[place]
+            return self._times[entry], digest(key, entry)
+
+        return sorted(range(len(entries)), key=rank)
 
     def give(self, entries: Sequence[str], place: int) -> None:
-        """Count the entry that a candidate has."""
+        """Count the entry at ``place`` as taken by a candidate."""
         if entries:
             self._times[entries[place]] += 1
 
 
 @dataclass(frozen=True)
 class Draws:
-    """What a plan draws for its episodes of one axis or combination.
+    """Source of perturbations for a plan's episodes of one axis or combination.
 
     Attributes:
-        name: of the axis or combination, as in ``plan.episodes``.
-        axes: what it draws from.
-        seed: of the plan.
-        test: the benchmark's tasks, of which draws keep clear.
+        name: name of the axis or combination, as in ``plan.episodes``.
+        axes: axes to sample from.
+        seed: seed of the plan.
+        test: the benchmark's tasks, to which perturbations keep their clearance.
     """
 
     name: str
@@ -196,33 +226,33 @@ class Draws:
     def of(
         self, demo_id: str, task: Task, dealt: Dealt | None = None, expanded_by: str = "[]"
     ) -> Iterator[tuple[Perturbation, ...]]:
-        """Sample for one demonstration, variant after variant: all different, and clear of the test set.
+        """Sample for one demonstration, variant after variant: all different, and each at its clearance from all tests.
 
         Args:
-            dealt: the entries of lists that other demonstrations of the task have; by default none.
-            expanded_by: JSON of the perturbations by which an expansion made the demonstration.
+            dealt: list entries that other demonstrations of the task have taken; no entries by default.
+            expanded_by: JSON of the perturbations with which an expansion generated the demonstration.
 
         Yields:
-            One perturbation of each axis, until no different draw is left.
+            One perturbation of each axis, until no different one is left.
 
         Raises:
-            PipelineError: when another version with other perturbations made the demonstration.
+            PipelineError: when another version with other perturbations generated the demonstration.
         """
         earlier = _earlier(demo_id, expanded_by)
         dealt = dealt or Dealt()
-        drawn: set[tuple[str, ...]] = set()
+        sampled: set[tuple[str, ...]] = set()
         for variant in count():
             key = (demo_id, variant)
             turns = [dealt.in_turn(axis.entries(task), digest(self.seed, self.name, *key)) for axis in self.axes]
             for attempt in range(_ATTEMPTS):
                 places = [places_of_axis[attempt % len(places_of_axis)] for places_of_axis in turns]
                 perturbations = self._sampled(task, places, earlier, (*key, attempt))
-                content = tuple(one.model_dump_json() for one in perturbations or ())
-                if perturbations and content not in drawn:
+                content = tuple(perturbation.model_dump_json() for perturbation in perturbations or ())
+                if perturbations and content not in sampled:
                     break
             else:
                 return
-            drawn.add(content)
+            sampled.add(content)
             for axis, place in zip(self.axes, places, strict=True):
                 dealt.give(axis.entries(task), place)
             yield perturbations
@@ -230,13 +260,13 @@ class Draws:
     def _sampled(
         self, task: Task, places: Sequence[int], earlier: Sequence[Perturbation], key: tuple[str | int, ...]
     ) -> tuple[Perturbation, ...] | None:
-        """One perturbation of each axis, ``None`` where one of them finds none that is clear."""
+        """Sample one perturbation of each axis, or return ``None`` if an axis has none that passes ``_clear``."""
         random = rng(self.seed, self.name, *key)
-        # All from one generator, before any is drawn anew from one of its own.
-        sampled = [
-            axis.sample(random, task, place).after(earlier) for axis, place in zip(self.axes, places, strict=True)
-        ]
-        instruction = " ".join(one.apply("") for one in sampled if isinstance(one, TextPerturbation))
+        # One generator samples all first perturbations. Each axis that samples again uses a generator of its own.
+        sampled = []
+        for axis, place in zip(self.axes, places, strict=True):
+            sampled.append(axis.sample(random, task, place).after(earlier))
+        instruction = " ".join(change.apply("") for change in sampled if isinstance(change, TextPerturbation))
         perturbations = []
         for number, (first, axis) in enumerate(zip(sampled, self.axes, strict=True)):
             clear = self._clear(first, axis, task, instruction, earlier, (*key, number))
@@ -254,32 +284,39 @@ class Draws:
         earlier: Sequence[Perturbation],
         key: tuple[str | int, ...],
     ) -> Perturbation | None:
-        """The ``first`` draw of an axis where it is clear, else another of its component and level.
+        """Return ``first`` if it is clear, else sample a clear perturbation of its component and level.
 
-        Or strengths near the test set's would become rare. None where none of many is clear: far enough from the test
-        set, and not named by the ``instruction``. A list has its next entry for that.
+        A clear perturbation keeps its clearance to the test set, and the ``instruction`` does not name it. Component
+        and level are kept because strengths near the test set's would otherwise become rare.
+
+        Returns:
+            The perturbation. ``None`` if many attempts give no clear one, or if the axis takes the entries of a list:
+            the caller then tries the next entry.
         """
 
-        def clear(one: Perturbation) -> bool:
-            return one.nearest(self.test, task).distance >= one.clearance and not one.named_in(instruction)
+        def is_clear(perturbation: Perturbation) -> bool:
+            nearest = perturbation.nearest(self.test, task)
+            return nearest.distance >= perturbation.clearance and not perturbation.named_in(instruction)
 
-        if clear(first):
+        if is_clear(first):
             return first
         if axis.entries(task):
             return None
-        again, alike = rng(self.seed, self.name, *key), axis.model_copy(update={"levels": (first.level,)})
+        random = rng(self.seed, self.name, *key)
+        axis_at_level = axis.model_copy(update={"levels": (first.level,)})
         for _ in range(_ATTEMPTS):
-            one = alike.sample(again, task, 0).after(earlier)
-            if (one.component, one.level) == (first.component, first.level) and clear(one):
-                return one
+            perturbation = axis_at_level.sample(random, task, 0).after(earlier)
+            is_alike = (perturbation.component, perturbation.level) == (first.component, first.level)
+            if is_alike and is_clear(perturbation):
+                return perturbation
         return None
 
 
 def _earlier(demo_id: str, expanded_by: str) -> tuple[Perturbation, ...]:
-    """Read the perturbations by which an expansion made a demonstration.
+    """Read the perturbations with which an expansion generated a demonstration.
 
     Raises:
-        PipelineError: when another version with other perturbations made it.
+        PipelineError: when another version with other perturbations generated it.
     """
     try:
         return tuple(from_json(expanded_by))
@@ -293,25 +330,29 @@ def _earlier(demo_id: str, expanded_by: str) -> tuple[Perturbation, ...]:
 
 
 def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:
-    """A task's candidates and their variants: every demonstration's first variant, then every second one, and so on.
+    """List a task's candidates: the first variant of every demonstration, then the second of every one, and so on.
 
-    A demonstration of which no more different draws are left that keep clear of the test set is passed over; the
-    candidates end when none is left of any.
+    A demonstration without further different perturbations is skipped. The candidates end when all demonstrations are
+    skipped.
+
+    Yields:
+        Demonstration, perturbations and number of the variant.
     """
     dealt = Dealt()
-    left = {demo: draws.of(demo.demo_id, demo.task, dealt, demo.perturbations) for demo in group}
+    samplers = {demo: draws.of(demo.demo_id, demo.task, dealt, demo.perturbations) for demo in group}
     for variant in count():
-        for demo, drawn in [*left.items()]:
-            if (perturbations := next(drawn, None)) is None:
-                del left[demo]
+        for demo, sampler in [*samplers.items()]:
+            perturbations = next(sampler, None)
+            if perturbations is None:
+                del samplers[demo]
             else:
                 yield demo, perturbations, variant
-        if not left:
+        if not samplers:
             return
 
 
 def _row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, replay: ReplayConfig) -> Row:
-    """A wanted episode, the first of its kind."""
+    """Build the row of a wanted episode, with rank and variant 0."""
     perturbations = in_order(perturbations)
     physics = to_json(of_layer(perturbations, PhysicsPerturbation))
     listed = to_json(perturbations)
@@ -345,19 +386,23 @@ def _row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, repl
 
 @lru_cache(maxsize=4096)
 def _identity(kind: str, demo_sha256: str, replay: ReplayConfig, perturbations: str) -> str:
+    """Hash the content that identifies an episode or a trajectory, 16 hexadecimal digits."""
     return digest(kind, demo_sha256, replay.model_dump(), perturbations)[:16]
 
 
 def write(rows: Sequence[Row], path: Path) -> None:
-    table = pa.table({column.name: [getattr(row, column.name) for row in rows] for column in fields(Row)})
-    write_table(table, path)
+    """Write a plan as a table."""
+    columns = {}
+    for column in fields(Row):
+        columns[column.name] = [getattr(row, column.name) for row in rows]
+    write_table(pa.table(columns), path)
 
 
 def read(path: Path) -> list[Row]:
-    """Read a plan back.
+    """Read a plan from its table.
 
     Raises:
-        PipelineError: when it is missing, damaged or not a plan of this version.
+        PipelineError: when the file is missing, damaged or not a plan of this version.
     """
     names = [column.name for column in fields(Row)]
     columns = read_table(path, names, MAKE_AGAIN).select(names).to_pydict()

@@ -1,4 +1,4 @@
-"""What became of each planned episode, and what has to be replayed next to know it."""
+"""Verdict on each planned episode, and the trajectories that must be replayed next to reach it."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -8,29 +8,29 @@ from pipeline.planning.plan import Row
 from pipeline.types import Verdict
 
 NOT_NEEDED = "reserve_not_needed"
-"""The reason of a reserve for whose quota others were kept."""
+"""Reason of a reserve whose quota was met by other episodes."""
 
 NOT_USED = Verdict(False, NOT_NEEDED)
 
 NOT_REPLAYED = "not_replayed"
-"""The reason of what is needed, as far as is known, and has no trajectory yet."""
+"""Reason of an episode that, by the verdicts so far, is needed and has no trajectory yet."""
 
 
 def pending(
     rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
 ) -> list[str]:
-    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given.
+    """List the trajectories that must be replayed next, in plan order, for the arguments of ``select``.
 
-    Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
+    A reserve is used only after a candidate failed. Callers therefore ask again until the list is empty.
     """
-    found = _verdicts(rows, verdicts, rejected)
-    return list(dict.fromkeys(row.trajectory_id for row, verdict in found if verdict is None))
+    judged = _verdicts(rows, verdicts, rejected)
+    return list(dict.fromkeys(row.trajectory_id for row, verdict in judged if verdict is None))
 
 
 def select(
     rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
 ) -> dict[str, Verdict]:
-    """What became of every row: kept, dropped with a reason, or a reserve that was not needed.
+    """Return the verdict on every row: kept, dropped with a reason, or a reserve that was not needed.
 
     Args:
         verdicts: trajectory id to its verdict.
@@ -43,10 +43,13 @@ def select(
 def _verdicts(
     rows: Iterable[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None
 ) -> Iterator[tuple[Row, Verdict | None]]:
-    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
+    """Judge every row.
 
-    The twins, and each axis or combination, have a quota for each task. A wanted candidate that fails is replaced by
-    the reserve that is most like it, so that what fails more often does not become rarer among kept episodes.
+    The twins, and each axis or combination, have a quota for each task. The most similar reserve replaces a wanted
+    candidate that fails. Perturbations that fail more often thus do not become rarer among kept episodes.
+
+    Yields:
+        Every row with its verdict; ``None`` for a row that, by the verdicts so far, is needed and is not replayed.
     """
 
     def judged(row: Row) -> Verdict | None:
@@ -59,11 +62,13 @@ def _verdicts(
         group = sorted(quota, key=lambda row: row.rank)
         reserves = [row for row in group if not row.wanted]
         results: dict[str, Verdict | None] = {}
-        for wanted in (row for row in group if row.wanted):
-            results[wanted.episode_id] = verdict = judged(wanted)
+        for candidate in group:
+            if not candidate.wanted:
+                continue
+            results[candidate.episode_id] = verdict = judged(candidate)
             # Count undecided candidates as kept until they are replayed.
             while verdict and not verdict.kept and reserves:
-                replacement = min(reserves, key=partial(_unlike, wanted))
+                replacement = min(reserves, key=partial(_unlike, candidate))
                 reserves.remove(replacement)
                 results[replacement.episode_id] = verdict = judged(replacement)
         for row in group:
@@ -71,7 +76,7 @@ def _verdicts(
 
 
 def _unlike(failed: Row, reserve: Row) -> tuple[int, bool, int]:
-    """How far a reserve's levels and components are from those of the candidate that it replaces; then its rank."""
+    """Return the dissimilarity of a reserve to the failed candidate: by levels, then by component, then by rank."""
     levels = zip(failed.level.split("+"), reserve.level.split("+"), strict=True)
-    apart = sum(abs(int(one) - int(other)) for one, other in levels)
-    return apart, failed.component != reserve.component, reserve.rank
+    level_difference = sum(abs(int(failed_level) - int(level)) for failed_level, level in levels)
+    return level_difference, failed.component != reserve.component, reserve.rank

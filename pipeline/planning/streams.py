@@ -1,4 +1,4 @@
-"""Which frames an episode shows: episodes that look the same share one stream of them. No simulator here."""
+"""Streams of frames: episodes that look equal share one stream. This module does not load the simulator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.seeding import digest
 
 @dataclass(frozen=True)
 class Stream:
-    """One view under the perturbations that show in it.
+    """View under the perturbations that show in it.
 
     Attributes:
         view: ``image`` or ``wrist_image``.
@@ -25,25 +25,33 @@ class Stream:
 
     @cached_property
     def stream_id(self) -> str:
+        """Hash of the view and the perturbations, 16 hexadecimal digits."""
         return digest("stream", self.view, to_json(self.perturbations))[:16]
 
     @property
     def changes(self) -> tuple[RenderPerturbation, ...]:
-        """The perturbations that change its scene."""
+        """Perturbations that change the rendered scene."""
         return of_layer(self.perturbations, RenderPerturbation)
 
     @property
     def geometry(self) -> Stream:
-        """The view under what changes its surfaces alone: streams that have it in common share their geometry."""
+        """Stream under the changes of visible surfaces alone; streams that share it share their geometry."""
         return Stream(self.view, tuple(change for change in self.changes if change.sees_otherwise))
 
     def scene(self, textures: bool = True) -> str:
-        """What streams have in common that show the same scene, or the same one but for its textures."""
+        """Return a key that streams of one scene share.
+
+        Args:
+            textures: true if scenes with different textures count as different scenes.
+        """
         return to_json([change for change in self.changes if textures or not change.paints])
 
 
 @lru_cache(maxsize=65536)
 def streams_of(perturbations_json: str) -> Mapping[str, Stream]:
-    """View name to the stream that shows it, for an episode with these perturbations."""
+    """Map each view name to the stream that shows it, for an episode with these perturbations."""
     visible = [p for p in from_json(perturbations_json) if isinstance(p, RenderPerturbation | PixelPerturbation)]
-    return {view: Stream(view, tuple(p for p in visible if view in p.views)) for view in SCHEMA.views}
+    streams = {}
+    for view in SCHEMA.views:
+        streams[view] = Stream(view, tuple(p for p in visible if view in p.views))
+    return streams

@@ -1,4 +1,4 @@
-"""One question to a language model behind an OpenAI-compatible endpoint, and the ways in which it can go wrong."""
+"""Client that asks a language model behind an OpenAI-compatible endpoint, and its errors."""
 
 import json
 import os
@@ -17,26 +17,31 @@ MAX_ANSWER_BYTES = 1_000_000
 
 
 class UnusableError(Exception):
-    """The endpoint answered, but not with a completion; asking again may help."""
+    """Answer of the endpoint that is no completion; a second attempt may help."""
 
 
 class _BusyError(Exception):
-    """The endpoint may answer later; ``wait_s`` is how long it asked to be left alone."""
+    """Failure of an endpoint that may answer later.
+
+    Attributes:
+        wait_s: waiting time that the endpoint asked for.
+    """
 
     def __init__(self, fault: str, wait_s: float = 0.0):
+        """Describe the ``fault`` of the attempt."""
         super().__init__(fault)
         self.wait_s = wait_s
 
 
 @dataclass(frozen=True)
 class LanguageModel:
-    """A model to ask. The key, where one is needed, comes from the environment variable ``OPENAI_API_KEY``.
+    """Language model to ask. A key, if needed, comes from the environment variable ``OPENAI_API_KEY``.
 
     Attributes:
         endpoint: address that ``/chat/completions`` is appended to, such as ``http://localhost:8000/v1``.
-        model: its name there.
-        timeout_s: for one whole answer.
-        backoff_s: before the second attempt; twice that before the third, and so on, up to ``LONGEST_WAIT_S``.
+        model: name of the model at the endpoint.
+        timeout_s: time limit for one whole answer.
+        backoff_s: waiting time before the second attempt; it doubles with each attempt, up to ``LONGEST_WAIT_S``.
     """
 
     endpoint: str
@@ -45,6 +50,7 @@ class LanguageModel:
     backoff_s: float = 2.0
 
     def __post_init__(self) -> None:
+        """Check that the endpoint is an address."""
         address = urllib.parse.urlsplit(self.endpoint)
         if address.scheme not in ("http", "https") or not address.hostname:
             raise PipelineError(
@@ -52,11 +58,11 @@ class LanguageModel:
             )
 
     def __call__(self, prompt: str) -> str:
-        """The model's answer to ``prompt``; tries again, ``ATTEMPTS`` times in all, while the endpoint is busy.
+        """Return the model's answer to ``prompt``; try up to ``ATTEMPTS`` times while the endpoint is busy.
 
         Raises:
-            UnusableError: when what came back is no completion.
-            PipelineError: when the endpoint refuses the question, or stays out of reach.
+            UnusableError: when the answer is no completion.
+            PipelineError: when the endpoint rejects the question, or stays out of reach.
         """
         wait_s = self.backoff_s
         faults: list[str] = []
@@ -76,25 +82,33 @@ class LanguageModel:
 
     @property
     def _url(self) -> str:
+        """Address for chat completions."""
         return f"{self.endpoint.rstrip('/')}/chat/completions"
 
     def _post(self, prompt: str) -> bytes:
+        """Send a prompt once and return the body of the answer.
+
+        Raises:
+            _BusyError: when a later attempt may succeed.
+            UnusableError: when the answer is too long.
+            PipelineError: when the address is not usable, or the endpoint rejects the question.
+        """
         question = {"model": self.model, "messages": [{"role": "user", "content": prompt}]}
         key = os.environ.get("OPENAI_API_KEY", "").strip()
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         body, deadline = b"", time.monotonic() + self.timeout_s
         try:
             client = _client()
-            # Follows no redirect, which would show the key to whoever it leads to.
+            # The client follows no redirect, because a redirect would show the key to another server.
             with client.stream("POST", self._url, json=question, headers=headers, timeout=self.timeout_s) as response:
                 for piece in response.iter_bytes():
                     body += piece
                     if len(body) > MAX_ANSWER_BYTES:
                         raise UnusableError(f"an answer of more than {MAX_ANSWER_BYTES} bytes")
-                    # The timeout is for each piece.
+                    # The client's timeout limits each piece, not the whole answer.
                     if time.monotonic() > deadline:
                         raise TimeoutError(f"no whole answer within {self.timeout_s:g} s")
-        except (httpx.InvalidURL, ImportError, ValueError) as error:  # the last two are of a proxy in the environment
+        except (httpx.InvalidURL, ImportError, ValueError) as error:  # a proxy in the environment raises the last two
             raise PipelineError(
                 f"cannot ask ({error})", where=self._url, expected="an http or https address"
             ) from error
@@ -102,11 +116,11 @@ class LanguageModel:
             raise _BusyError(str(error) or type(error).__name__) from error
         if response.is_success:
             return body
-        said = " ".join(body[:300].decode(errors="replace").split())
-        fault = f"HTTP status {response.status_code} {response.reason_phrase}: {said}".rstrip(": ")
+        message = " ".join(body[:300].decode(errors="replace").split())
+        fault = f"HTTP status {response.status_code} {response.reason_phrase}: {message}".rstrip(": ")
         if response.status_code == 429 or response.is_server_error:
-            after = response.headers.get("Retry-After", "")
-            raise _BusyError(fault, float(after) if after.isdigit() else 0.0)
+            retry_after = response.headers.get("Retry-After", "")
+            raise _BusyError(fault, float(retry_after) if retry_after.isdigit() else 0.0)
         raise PipelineError(
             f"the endpoint refuses the question ({fault})",
             where=self._url,
@@ -117,11 +131,16 @@ class LanguageModel:
 
 @cache
 def _client() -> httpx.Client:
-    """Of this process: making one takes 0.05 s."""
+    """Return this process's client; creating one takes 0.05 s."""
     return httpx.Client()
 
 
 def _content(body: bytes) -> str:
+    """Return the text of a completion.
+
+    Raises:
+        UnusableError: when ``body`` is no completion.
+    """
     try:
         content = json.loads(body)["choices"][0]["message"]["content"]
     except (ValueError, RecursionError) as error:

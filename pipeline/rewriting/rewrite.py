@@ -1,13 +1,13 @@
-"""Rewrites of a task's instruction by a language model, let into a bank through the gate that the language axis has.
+"""Rewrites of a task's instruction by a language model, added to a bank if they pass the checks of the language axis.
 
-The bank is a file of the form of ``axes/language_bank.yaml``. Nothing that a model says is trusted: answers are read
-for lists, each sentence is linted as ``axes/language.py`` lints the bank, and what is missing is asked for again.
+The bank is a file of the form of ``axes/language_bank.yaml``. No answer of a model is trusted: this module reads lists
+from the answers, lints each sentence as ``axes/language.py`` lints the bank, and asks again for missing rewrites.
 """
 
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -26,29 +26,33 @@ from pipeline.rewriting.language_model import UnusableError
 from pipeline.types import Task
 
 IDLE_ANSWERS = 3
-"""After so many answers in a row without one new rewrite, a class is given up."""
+"""Consecutive answers without a new rewrite after which a class is given up."""
 
 ASKED_AT_ONCE = 20
-"""Longer lists get worse towards their end."""
+"""Most rewrites in one request; longer lists get worse towards their end."""
 
 
 def brief(bddl_file: Path) -> dict[str, Any]:
-    """Read a task's scene and goal, as a model is told of them.
+    """Read a task's scene and goal for the prompt.
 
     Returns:
-        ``task``, whose suite and name, its place in a bank, are the BDDL file's folder and stem, and whose instruction
-        is LIBERO's where the task is one of LIBERO's; kinds of movable objects and fixtures, with their number where
-        there are several (``things``); what is where at first (``start``), and has to be so at the end (``goal``).
+        A dictionary with these entries:
+
+        * ``task``: its suite and name, the keys in a bank, are the BDDL file's folder and stem. Its instruction is
+          LIBERO's if the task is one of LIBERO's.
+        * ``things``: kinds of movable objects and fixtures, with their number if there are several.
+        * ``start``: relations at the start.
+        * ``goal``: relations that must hold at the end.
 
     Raises:
         PipelineError: when the file cannot be read or does not define a task.
     """
     bddl = read(bddl_file)
     suite, name = bddl_file.resolve().parent.name, bddl_file.stem
-    known = {task.name: task.instruction for task in tasks(suite)} if suite in SUITES else {}
+    instructions = {task.name: task.instruction for task in tasks(suite)} if suite in SUITES else {}
     kinds = Counter([*bddl.objects.values(), *bddl.fixtures.values()])
     return {
-        "task": Task(suite, name, known.get(name, bddl.language), bddl_file),
+        "task": Task(suite, name, instructions.get(name, bddl.language), bddl_file),
         "things": [_words(kind) if count == 1 else f"{count} x {_words(kind)}" for kind, count in kinds.items()],
         "start": list(map(_sentence, bddl.start)),
         "goal": list(map(_sentence, bddl.goal)),
@@ -56,27 +60,34 @@ def brief(bddl_file: Path) -> dict[str, Any]:
 
 
 def _words(name: str) -> str:
+    """Return a name in plain words."""
     return name.replace("_", " ")
 
 
 def _sentence(fact: Fact) -> str:
-    """``on(plate 1, table)`` for ``(on plate_1 table)``."""
+    """Format a fact such as ``(on plate_1 table)`` as ``on(plate 1, table)``."""
     return f"{fact[0]}({', '.join(map(_words, fact[1:]))})"
 
 
 def prompt(told: Mapping[str, Any], component: Component, count: int, have: list[str], refused: Counter[str]) -> str:
-    """The question for ``count`` more rewrites of one class."""
-    text = Path(__file__).with_name("prompt.txt.j2").read_text()
+    """Write the question for ``count`` more rewrites of one class.
+
+    Args:
+        told: result of ``brief``.
+        have: rewrites that the model must not repeat.
+        refused: reasons for the rejection of earlier rewrites; the five most common ones enter the question.
+    """
+    template = Path(__file__).with_name("prompt.txt.j2").read_text()
     reasons = [reason for reason, _ in refused.most_common(5)]
-    known = {**told, "component": component, "count": count, "have": have, "refused": reasons, "length": LENGTH}
-    question: str = Template(text, undefined=StrictUndefined, trim_blocks=True).render(known)
+    fields = {**told, "component": component, "count": count, "have": have, "refused": reasons, "length": LENGTH}
+    question: str = Template(template, undefined=StrictUndefined, trim_blocks=True).render(fields)
     return question
 
 
 def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]) -> None:
     """Ask until the bank ``out`` has ``per_class`` rewrites of each class for the task.
 
-    What ``out`` holds stays, and after each answer it holds what was accepted, so a run that was stopped goes on.
+    Rewrites in ``out`` stay. Each answer's accepted rewrites are stored at once, so that a stopped run can resume.
 
     Args:
         bddl_file: the task, ``<suite>/<task>.bddl``.
@@ -85,21 +96,22 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     Raises:
         PipelineError: when a file cannot be read, the model cannot be reached, or too few rewrites were acceptable.
     """
-    told, bank = brief(bddl_file), read_bank(out) if out.exists() else {}
-    task: Task = told["task"]
+    task_brief = brief(bddl_file)
+    bank = read_bank(out) if out.exists() else {}
+    task: Task = task_brief["task"]
     stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
-    for component, text in ((component, text) for component, texts in stored.items() for text in texts):
-        if fault := lint(text, task, component):  # which the language axis would refuse
-            what = f"{component} rewrite {text!r} of {task} is refused: {fault}"
-            raise PipelineError(what, where=out, remedy=REMEDY)
+    _check_stored(stored, task, out)
     shipped = load_bank().get(task.suite, {}).get(task.name, {})
-    taken = {normalise(text) for texts in (*stored.values(), *shipped.values()) for text in texts}
+    taken: set[str] = set()
+    for texts in (*stored.values(), *shipped.values()):
+        taken |= {normalise(text) for text in texts}
     refused: Counter[str] = Counter()
     for component in CLASSES:
         idle = 0
-        while (missing := per_class - len(stored[component])) > 0 and idle < IDLE_ANSWERS:
+        while len(stored[component]) < per_class and idle < IDLE_ANSWERS:
+            missing = per_class - len(stored[component])
             have = [*shipped.get(component, ()), *stored[component]]
-            question = prompt(told, component, min(missing, ASKED_AT_ONCE), have, refused)
+            question = prompt(task_brief, component, min(missing, ASKED_AT_ONCE), have, refused)
             try:
                 accepted, reasons = _sift(listed(ask(question)), task, component, taken, missing)
             except UnusableError as error:
@@ -121,10 +133,31 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
         )
 
 
+def _check_stored(stored: Mapping[Component, Sequence[str]], task: Task, out: Path) -> None:
+    """Check the rewrites that ``out`` has already.
+
+    Raises:
+        PipelineError: when the language axis would reject one of them.
+    """
+    for component, texts in stored.items():
+        for text in texts:
+            fault = lint(text, task, component)
+            if fault:
+                what = f"{component} rewrite {text!r} of {task} is refused: {fault}"
+                raise PipelineError(what, where=out, remedy=REMEDY)
+
+
 def _sift(
     offered: list[str], task: Task, component: Component, taken: set[str], wanted: int
 ) -> tuple[list[str], Counter[str]]:
-    """The first ``wanted`` sentences that pass the gate, noted in ``taken``, and why others before them did not."""
+    """Select the first ``wanted`` sentences that pass the checks, and add them to ``taken``.
+
+    Returns:
+        The selected sentences, and the counts of the reasons why earlier sentences were rejected.
+
+    Raises:
+        UnusableError: when ``offered`` is empty.
+    """
     if not offered:
         raise UnusableError("an answer without a list")
     accepted: list[str] = []
@@ -132,7 +165,10 @@ def _sift(
     for text in map(tidy, offered):
         if len(accepted) == wanted:
             break
-        if fault := lint(text, task, component) or ("a repetition" if normalise(text) in taken else None):
+        fault = lint(text, task, component)
+        if not fault and normalise(text) in taken:
+            fault = "a repetition"
+        if fault:
             reasons[fault] += 1
         else:
             accepted.append(text)
@@ -141,43 +177,46 @@ def _sift(
 
 
 def _because(reasons: Counter[str]) -> str:
+    """Format the reasons of rejected rewrites, the most common first; empty if there are none."""
     counted = "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common())
     return f" (refused: {counted})" if counted else ""
 
 
 _THOUGHT = re.compile(r"<think>.*?</think>", re.DOTALL)
 _MARKED = re.compile(r"""\s*(?:(?:\d+\s*[.):]|[-*•])\s+(.+)|\[?\s*["“](.+)["”],?\s*$)""")
-"""A line that is numbered, bulleted or in quotation marks."""
+"""Line that is numbered, bulleted or in quotation marks."""
 
 
 def listed(answer: str) -> list[str]:
-    """The sentences of an answer: its JSON list, or else its numbered, bulleted or quoted lines.
+    """Read the sentences of an answer: its JSON list, or else its numbered, bulleted or quoted lines.
 
-    Whatever stands around the list (preambles, code fences, a model's thoughts) is no part of it.
+    Text around the list (preambles, code fences, a model's thoughts) is ignored.
     """
     answer = _THOUGHT.sub("", answer)
     try:
-        found = json.loads(answer[answer.find("[") : answer.rfind("]") + 1])
+        items = json.loads(answer[answer.find("[") : answer.rfind("]") + 1])
     except (ValueError, RecursionError):
-        marked = (_MARKED.match(line) for line in answer.splitlines())
+        marked = [_MARKED.match(line) for line in answer.splitlines()]
         return [match[1] or match[2] for match in marked if match]
-    return [item if isinstance(item, str) else _only_text(item) for item in found]
+    return [item if isinstance(item, str) else _only_text(item) for item in items]
 
 
 def _only_text(item: object) -> str:
-    """The sentence in an entry such as ``{"rewrite": "..."}``."""
-    texts = [value for value in item.values() if isinstance(value, str)] if isinstance(item, dict) else []
+    """Return the sentence in an entry such as ``{"rewrite": "..."}``; empty if there is not exactly one."""
+    if not isinstance(item, dict):
+        return ""
+    texts = [value for value in item.values() if isinstance(value, str)]
     return texts[0] if len(texts) == 1 else ""
 
 
 def tidy(text: str) -> str:
-    """In lower case, without surplus white space, quotation marks around it and punctuation at its end."""
+    """Convert to lower case and remove surplus white space, outer quotation marks and final punctuation."""
     plain = " ".join(text.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split())
     return plain.strip("\"'`, \N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}").rstrip(".!? ")
 
 
 def _write(bank: Bank, path: Path) -> None:
-    """Replace the bank, but for the comments that it begins with."""
+    """Replace the bank in ``path``, except the comments at its beginning."""
     lines = path.read_text(encoding="ascii").splitlines(keepends=True) if path.exists() else []
     head = "".join(takewhile(lambda line: line.startswith("#"), lines))
     plain = TypeAdapter(Bank).dump_python(bank, mode="json")
