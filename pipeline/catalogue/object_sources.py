@@ -201,10 +201,10 @@ def _copy(mjcf: Path, out: Path) -> None:
             file = (mjcf.parent / asset.attrib["file"]).resolve()
             if not file.is_relative_to(mjcf.parent.resolve()):
                 raise PipelineError(
-                    f"the file {asset.attrib['file']} lies elsewhere",
+                    f"the file {asset.attrib['file']} is outside of the model's folder",
                     where=mjcf,
-                    expected="files beside the model",
-                    remedy="copy it beside the model, and name it from there",
+                    expected="files in the model's folder, or below it",
+                    remedy="copy the file into the model's folder, and name it by its path from this folder",
                 )
             asset.set("name", asset_name(asset))
             asset.set("file", f"{number}{file.suffix}")

@@ -62,8 +62,8 @@ def relocate(xml: str, where: str) -> str:
         where: name of the model for error messages.
 
     Raises:
-        PipelineError: when ``xml`` is not an MJCF document, names a file outside the two asset folders or a file that
-            is not installed, or has content that can reach other files (includes, plugins, entities).
+        PipelineError: when ``xml`` is not an MJCF document, or names a file that is not an installed asset. Also when
+            its content can reach other files (includes, plugins, entities).
     """
 
     def refuse(

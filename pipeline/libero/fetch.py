@@ -34,14 +34,14 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         The files of the suites, in the order of their tasks.
 
     Raises:
-        PipelineError: when a suite is unknown, when a file with the name of a wanted file is not the hub's, and when
-            the hub could not be reached or lacks a file.
+        PipelineError: when a suite is unknown, or a file with the name of a wanted file is not the hub's. Also when
+            the hub cannot be reached or lacks a file.
     """
     wanted: list[str] = []
     for suite in suites:
         wanted += [f"{task}_demo.hdf5" for task in tasks(suite)]
     remedy = (
-        "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, it goes on where it stopped; "
+        "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, the download resumes; "
         "or use the starter set, demos.source: starter, which needs no hub"
     )
     try:
@@ -73,7 +73,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
             missing.append(name)
     if missing:
         raise PipelineError(
-            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} could not be had whole, such as {missing[0]}",
+            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} are missing or incomplete, such as {missing[0]}",
             where=out,
             remedy=remedy,
         )

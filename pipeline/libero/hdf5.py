@@ -46,8 +46,8 @@ REMEDIES = {
 EXPANDED_FROM, EXPANDED_FROM_SHA256, ORIGIN_SHA256 = "expanded_from", "expanded_from_sha256", "origin_sha256"
 """Attributes of a demonstration that an expansion generated.
 
-They hold the id and the content hash of the demonstration that it was generated from, and the content hash of the human
-demonstration at its origin.
+They hold the id and the content hash of its direct source, and the content hash of the human demonstration at its
+origin.
 """
 
 # LIBERO's longest demonstrations have about 500 steps. Without a limit, a few bytes of header could request all memory.

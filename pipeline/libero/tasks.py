@@ -163,7 +163,7 @@ def exceeds_step_limit(suite: str, steps: int) -> bool | None:
 
 
 def shared(task: Task, same: Same) -> Hashable:
-    """Return a key that is equal for tasks with the same task or the same scene, as ``same`` states."""
+    """Return a key that is equal for tasks that have the part ``same`` in common."""
     return (task.suite, task.name) if same == "task" else bddl.read(task.bddl_file).scene
 
 

@@ -14,7 +14,7 @@ Joints = NDArray[np.intp]
 
 ARM = tuple(f"robot0_joint{number}" for number in range(1, 8))
 FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
-"""The robot's joints, base to wrist, and those of its gripper."""
+"""Joints of the robot's arm, base to wrist, and joints of its gripper."""
 
 
 def compiled(model_xml: str) -> mujoco.MjModel:
