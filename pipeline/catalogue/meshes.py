@@ -1,7 +1,7 @@
-"""A Wavefront OBJ with its materials to a MuJoCo model of one object: visual meshes, and a convex hull for contacts.
+"""Conversion of a Wavefront OBJ with its materials to a MuJoCo model of one object.
 
-trimesh takes seconds to import, and every process of a run imports this module, but hardly any converts a mesh: so it
-is imported where it is used.
+The model has visual meshes, and a convex hull for contacts. trimesh is imported by the functions that use it: its
+import takes seconds, and every process of a run imports this module, but hardly any process converts a mesh.
 """
 
 from pathlib import Path
@@ -16,10 +16,10 @@ from pipeline.errors import PipelineError
 from pipeline.types import Floats
 
 RECIPE = 1
-"""Raise it whenever a change here changes what comes out: what was converted before is then converted again."""
+"""Number to raise whenever a change here changes the converted models: earlier models are then converted again."""
 
 FACES = 6000
-"""Faces that a model may have; LIBERO's own have up to 20,000."""
+"""Largest number of faces of a model; LIBERO's own models have up to 20,000."""
 _SMALL_PART = 300
 _HULL_VERTICES = 48
 _THINNEST_M = 1e-3
@@ -35,7 +35,7 @@ class _Surface(NamedTuple):
     Attributes:
         vertices: (V, 3) metres, z up.
         faces: (F, 3) indices.
-        uv: (V, 2) where a texture goes with it.
+        uv: (V, 2) texture coordinates, if the mesh has a texture.
     """
 
     vertices: Floats
@@ -44,7 +44,7 @@ class _Surface(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """The faces of one material; with an image, they have ``uv``."""
+    """The faces of one material; if the material has an image, the surface has ``uv``."""
 
     surface: _Surface
     rgba: Floats
@@ -54,17 +54,18 @@ class _Part(NamedTuple):
 def convert(obj: Path, out: Path, size_m: tuple[float, float, float] | None = None, turn: Floats | None = None) -> None:
     """Write ``model.xml``, meshes and textures of an OBJ (y up) into the folder ``out``.
 
-    The model stands on the origin with z up. One convex hull is what it collides with: objects that the
-    robot only has to avoid need no more, and a hull is the same on every machine.
+    The model stands on the origin with z up. Its collision geometry is one convex hull: this is enough for objects
+    that the robot only has to avoid, and a hull is equal on every machine.
 
     Args:
-        obj: the model; its materials and textures are found beside it.
+        obj: the model; its materials and textures are in the same folder.
         out: an existing folder.
-        size_m: extent along x, depth and height that the model is scaled to; as it is, in metres, when left out.
+        size_m: extent along x, depth and height that the model is scaled to; without it, the model keeps its size in
+            metres.
         turn: (3, 3) rotation of the model before it is scaled.
 
     Raises:
-        PipelineError: when it is not a readable OBJ, or too flat or broken for a hull.
+        PipelineError: when the file is not a readable OBJ, or the model is too flat or broken for a hull.
     """
     import trimesh
 
@@ -104,12 +105,17 @@ def convert(obj: Path, out: Path, size_m: tuple[float, float, float] | None = No
 
 
 def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: Floats) -> list[_Part]:
+    """Load an OBJ as parts of one material each: turned, scaled, z up, with the origin in the middle of the underside.
+
+    Args:
+        obj, size_m, turn: see ``convert``.
+    """
     import trimesh
 
     scene = trimesh.load_scene(obj, process=False)
     meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
-    every = np.concatenate([mesh.vertices @ turn.T for mesh in meshes])
-    low, high = every.min(axis=0), every.max(axis=0)
+    vertices = np.concatenate([mesh.vertices @ turn.T for mesh in meshes])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = np.ones(3)
     if size_m is not None:
         width, depth, height = size_m
@@ -136,13 +142,16 @@ def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: Floats) -
 
 
 def _simplified(surface: _Surface, share: float) -> _Surface:
-    """Fewer faces; a small part and a textured one keep theirs, as collapsing edges would distort the texture."""
+    """Reduce the faces of a surface to about ``share`` of their number.
+
+    Small parts keep their faces. Textured parts keep them too, because collapsing edges would distort the texture.
+    """
     if surface.uv is not None or len(surface.faces) < _SMALL_PART:
         return surface
     import fast_simplification
     import trimesh
 
-    # Faces that share places but not vertices (for normals of their own) would come apart.
+    # Some faces share positions but not vertices, because each has its own normals. Unmerged, they would come apart.
     merged = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     merged.merge_vertices(merge_norm=True, merge_tex=True)
     vertices, faces = fast_simplification.simplify(
@@ -152,7 +161,7 @@ def _simplified(surface: _Surface, share: float) -> _Surface:
 
 
 def _thickened(surface: _Surface) -> _Surface:
-    """A flat part with a back; MuJoCo finds no frame for a mesh without volume."""
+    """Give a flat part a back, because MuJoCo finds no frame for a mesh without volume."""
     vertices, faces, uv = surface
     used = vertices[np.unique(faces)]
     _, extents, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
@@ -171,5 +180,7 @@ def _write_obj(path: Path, surface: _Surface) -> None:
     corner = "{0}" if surface.uv is None else "{0}/{0}"
     if surface.uv is not None:
         lines += [f"vt {u:.5f} {v:.5f}" for u, v in surface.uv]
-    lines += ["f " + " ".join(corner.format(index + 1) for index in face) for face in surface.faces]
+    for face in surface.faces:
+        corners = " ".join(corner.format(index + 1) for index in face)
+        lines.append(f"f {corners}")
     path.write_text("\n".join(lines) + "\n")

@@ -1,4 +1,4 @@
-"""One object: a small MJCF model, measured, stood upright and made ready to be put into a scene."""
+"""Small MJCF models of objects: measured, turned upright and prepared for a scene."""
 
 import copy
 import hashlib
@@ -18,7 +18,7 @@ _UPRIGHT = {"z": np.array([1.0, 0.0, 0.0, 0.0]), "y": np.array([1.0, 1.0, 0.0, 0
 """Rotations (w x y z) that bring a model's upward axis to the world's z."""
 _DENSITY = 400.0
 _MASS_KG = (0.05, 0.5)
-# As LIBERO's objects touch the table, and with friction against rolling: a ball comes to rest.
+# Contact parameters between LIBERO's objects and the table, plus friction against rolling: a ball comes to rest.
 _CONTACT = {
     "priority": "1",
     "friction": "0.95 0.3 0.1",
@@ -29,24 +29,24 @@ _CONTACT = {
 
 _PLACES = {"axisangle", "xyaxes", "zaxis", "fromto"}
 _TAGS = {"default", "include", "deformable", "frame", "replicate", "composite", "flexcomp", "attach"}
-"""Attributes and elements that place geoms in ways that are not read here."""
+"""Elements that, like the attributes ``_PLACES``, place geoms in ways that this module does not read."""
 _NOT_READ = {
     "compiler": {"strippath", "discardvisual"},
     "texture": {"fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"},
     "geom": {"fitscale", "hfield"},
 }
-"""Element to attributes that change which files are used or what is seen, and that are not read here."""
+"""Element to attributes that change a model's files or appearance, and that this module does not read."""
 _TYPES_NOT_READ = {"plane", "hfield", "sdf"}
 _VIEWED = {"0", "1", "2"}
 """Groups of geoms that MuJoCo's viewer shows."""
 
 
 class Shape(NamedTuple):
-    """What a model measures when it stands.
+    """Measures of a model that stands upright.
 
     Attributes:
         low_m, high_m: (3,) bounds of its collision geometry in its own frame turned upright.
-        volume_m3: of its collision geometry.
+        volume_m3: volume of its collision geometry.
     """
 
     low_m: tuple[float, ...]
@@ -55,7 +55,7 @@ class Shape(NamedTuple):
 
     @property
     def footprint_m2(self) -> float:
-        """Area that it takes up where it stands."""
+        """Area of the rectangle that the model stands on."""
         return (self.high_m[0] - self.low_m[0]) * (self.high_m[1] - self.low_m[1])
 
 
@@ -65,10 +65,10 @@ class ObjectModel:
 
     Attributes:
         name: ``<source>/<name>``, unique.
-        category: what an instruction would call it.
-        licence, attribution: for the dataset's card.
-        mjcf: its model, whose files lie in the same folder or below.
-        up: the axis of the model that points up when it stands.
+        category: noun that an instruction would use, such as ``bottle_of_milk``.
+        licence, attribution: texts for the dataset's card.
+        mjcf: file of its model; the model's files are in the same folder or below.
+        up: the axis of the model that points up when the model stands.
     """
 
     name: str
@@ -81,25 +81,26 @@ class ObjectModel:
     @cached_property
     def sha256(self) -> str:
         """Hash of the model and of every file that it uses."""
-        return hashlib.sha256(b"".join(file.read_bytes() for file in (self.mjcf, *self.files))).hexdigest()
+        contents = [file.read_bytes() for file in (self.mjcf, *self.files)]
+        return hashlib.sha256(b"".join(contents)).hexdigest()
 
     @cached_property
     def files(self) -> tuple[Path, ...]:
-        """Its meshes and textures."""
+        """Files of its meshes and textures."""
         return tuple(sorted({Path(asset.get("file", "")) for asset in self._assets if asset.get("file")}))
 
     @cached_property
     def shape(self) -> Shape:
-        """Measured by compiling its collision geometry alone.
+        """Measures of the object, computed by compiling its collision geometry alone.
 
         Raises:
-            PipelineError: when there is none, or it is broken.
+            PipelineError: when the model has no collision geometry, or MuJoCo cannot compile it.
         """
         import mujoco
 
         assets = "".join(ET.tostring(asset, "unicode") for asset in self._assets if asset.tag == "mesh")
-        touched = (geom for geom in self._geoms("", (0, 0, 0), 1.0) if not _is_visual(geom))
-        geoms = "".join(ET.tostring(geom, "unicode") for geom in touched)
+        colliding = [geom for geom in self._geoms("", (0, 0, 0), 1.0) if not _is_visual(geom)]
+        geoms = "".join(ET.tostring(geom, "unicode") for geom in colliding)
         try:
             model = mujoco.MjModel.from_xml_string(
                 f'<mujoco><asset>{assets}</asset><worldbody><body name="object">{geoms}</body></worldbody></mujoco>'
@@ -115,29 +116,36 @@ class ObjectModel:
         return Shape(tuple(points.min(axis=0).tolist()), tuple(points.max(axis=0).tolist()), volume)
 
     def mjcf_of(self, prefix: str) -> tuple[str, str]:
-        """Its assets and its body as MJCF, every name beginning with ``prefix``, every path absolute.
+        """Return its assets and its body as MJCF; every name begins with ``prefix``, every path is absolute.
 
-        The body ``prefix`` is free; its frame has z up and its origin in the middle of the underside.
+        The body ``prefix`` has a free joint. Its frame has z up and its origin in the middle of the underside.
         """
         low, high, volume = self.shape
         density = float(np.clip(_DENSITY * volume, *_MASS_KG)) / volume
         body = ET.Element("body", name=prefix)
         ET.SubElement(body, "joint", name=f"{prefix}_joint0", type="free", damping="0.0005")
-        body.extend(self._geoms(prefix, (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]), density))
-        assets = [_renamed(asset, prefix) for asset in self._assets]
-        return "".join(ET.tostring(asset, "unicode") for asset in assets), ET.tostring(body, "unicode")
+        underside_to_origin_m = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
+        body.extend(self._geoms(prefix, underside_to_origin_m, density))
+        assets = "".join(ET.tostring(_renamed(asset, prefix), "unicode") for asset in self._assets)
+        return assets, ET.tostring(body, "unicode")
 
     @cached_property
     def _root(self) -> ET.Element:
+        """Root of the parsed MJCF.
+
+        Raises:
+            PipelineError: when the file is not readable, or has content that cannot be moved to another model.
+        """
         try:
             root = ET.parse(self.mjcf).getroot()
         except (OSError, ET.ParseError) as error:
             raise PipelineError(f"not a readable model ({error})", where=self.mjcf) from error
-        # What would change the meaning of the geoms when they are moved to another model.
+        # Reject settings that would change the meaning of the geoms when they are moved to another model.
         folders = {"meshdir", "texturedir", "assetdir"}
         redirected = any(folders & set(compiler.attrib) for compiler in root.iter("compiler"))
         turned = any(element.get("euler", "0 0 0") != "0 0 0" for element in root.iter())
-        placed = any(_PLACES & element.attrib.keys() for tag in ("body", "geom") for element in root.iter(tag))
+        bodies_and_geoms = [*root.iter("body"), *root.iter("geom")]
+        placed = any(_PLACES & element.attrib.keys() for element in bodies_and_geoms)
         if redirected or turned or placed or any(element.tag in _TAGS for element in root.iter()):
             raise PipelineError(
                 "the model uses defaults, includes, frames, asset folders or rotations that are no quat",
@@ -145,7 +153,8 @@ class ObjectModel:
                 expected="paths relative to the model, pos and quat for places, every attribute on its element",
                 remedy="compile it, save it with mujoco.mj_saveLastXML, then resolve frames and defaults",
             )
-        if unread := sorted(_unread(root)):
+        unread = sorted(_unread(root))
+        if unread:
             raise PipelineError(
                 f"the model has {', '.join(unread)}, which would be left out",
                 where=self.mjcf,
@@ -157,40 +166,54 @@ class ObjectModel:
     @cached_property
     def _assets(self) -> tuple[ET.Element, ...]:
         """Meshes, materials and textures that the geoms use, with absolute paths."""
-        used = {geom.get(kind) for geom in self._root.iter("geom") for kind in ("mesh", "material")} - {None}
+        used: set[str | None] = set()
+        for geom in self._root.iter("geom"):
+            used |= {geom.get("mesh"), geom.get("material")}
+        used.discard(None)
         for material in self._root.iter("material"):
             if material.get("name") in used:
-                used |= {material.get("texture"), *(layer.get("texture") for layer in material.iter("layer"))}
+                used.add(material.get("texture"))
+                used.update(layer.get("texture") for layer in material.iter("layer"))
         assets = []
         for asset in self._root.findall("asset/*"):
-            if (name := asset_name(asset)) in used:
-                asset = copy.deepcopy(asset)
-                asset.set("name", name)
-                if file := asset.get("file"):
-                    asset.set("file", str((self.mjcf.parent / file).resolve()))
-                assets.append(asset)
+            name = asset_name(asset)
+            if name not in used:
+                continue
+            asset = copy.deepcopy(asset)
+            asset.set("name", name)
+            file = asset.get("file")
+            if file:
+                asset.set("file", str((self.mjcf.parent / file).resolve()))
+            assets.append(asset)
         return tuple(assets)
 
     def _geoms(self, prefix: str, shift_m: Sequence[float], density: float) -> Iterator[ET.Element]:
-        """Its geoms as those of one body that stands upright, moved by ``shift_m``; visual geoms have no mass."""
+        """Yield its geoms as geoms of one body that stands upright, moved by ``shift_m``.
+
+        A geom that collides and is visible gives two geoms. Visual geoms have no mass.
+        """
         placed = list(_placed(self._root.findall("worldbody/body"), np.array(shift_m, float), _UPRIGHT[self.up]))
-        drawn = _drawn([geom for geom, _, _ in placed])
+        visible = _drawn([geom for geom, _, _ in placed])
         for geom, pos, quat in placed:
             shape = {key: value for key, value in geom.attrib.items() if key in ("type", "mesh", "size")}
             shape |= {"pos": _numbers(pos), "quat": _numbers(quat)}
             if not _is_visual(geom):
-                touch = {**shape, **_CONTACT, "density": f"{density:.4f}", "group": "0", "rgba": "0 0 0 0"}
-                yield _renamed(ET.Element("geom", touch), prefix)
-            if geom in drawn:
-                look = {key: value for key, value in geom.attrib.items() if key in ("material", "rgba")}
-                seen = {**shape, **look, "contype": "0", "conaffinity": "0", "mass": "0", "group": "1"}
-                yield _renamed(ET.Element("geom", seen), prefix)
+                colliding = {**shape, **_CONTACT, "density": f"{density:.4f}", "group": "0", "rgba": "0 0 0 0"}
+                yield _renamed(ET.Element("geom", colliding), prefix)
+            if geom in visible:
+                colours = {key: value for key, value in geom.attrib.items() if key in ("material", "rgba")}
+                visual = {**shape, **colours, "contype": "0", "conaffinity": "0", "mass": "0", "group": "1"}
+                yield _renamed(ET.Element("geom", visual), prefix)
 
 
 def _placed(bodies: Iterable[ET.Element], pos: Floats, quat: Floats) -> Iterator[tuple[ET.Element, Floats, Floats]]:
-    """Every geom of the bodies with its pose (position in m, quaternion w x y z) where their parent has the given one.
+    """Yield every geom of the bodies with its pose: position (3,) in m and quaternion (4,) w x y z.
 
     Joints are left out, so that everything stands as it is modelled.
+
+    Args:
+        bodies: elements whose geoms and child bodies are read.
+        pos, quat: pose of the bodies' parent.
     """
     import mujoco
 
@@ -213,15 +236,16 @@ def _numbers(values: Floats) -> str:
 
 
 def asset_name(asset: ET.Element) -> str:
-    """The name by which geoms and materials call an asset; without one, MuJoCo names it after its file."""
+    """Return the name that geoms and materials use for an asset: its own, or else that of its file, as in MuJoCo."""
     return asset.get("name") or Path(asset.get("file", "")).stem
 
 
 def _unread(root: ET.Element) -> Iterator[str]:
-    """What of a model would be left out without a trace."""
+    """Yield the parts of a model that would be left out without a trace."""
     for tag, attributes in _NOT_READ.items():
         for element in root.iter(tag):
-            yield from (f"<{tag} {name}>" for name in attributes & element.attrib.keys())
+            for name in attributes & element.attrib.keys():
+                yield f"<{tag} {name}>"
     for geom in root.iter("geom"):
         if geom.get("type") in _TYPES_NOT_READ:
             yield f"<geom type={geom.get('type')}>"
@@ -236,20 +260,20 @@ def _is_visual(geom: ET.Element) -> bool:
 
 
 def _drawn(geoms: Sequence[ET.Element]) -> list[ET.Element]:
-    """The geoms that are seen: those that MuJoCo's viewer shows.
+    """Return the visible geoms: the geoms that MuJoCo's viewer shows.
 
-    Where some geoms only look, colliding ones of a stated group 0 are not seen: robosuite, and so LIBERO, keeps the
-    collision geometry there and renders group 1. All are seen where else none would be.
+    If the model has visual geoms, its colliding geoms with an explicit group 0 are not visible: robosuite, and
+    therefore LIBERO, keeps collision geometry in group 0 and renders group 1. If no geom would be visible, all are.
     """
-    only_look = any(_is_visual(geom) for geom in geoms)
+    has_visual = any(_is_visual(geom) for geom in geoms)
     viewed = [geom for geom in geoms if geom.get("group", "0") in _VIEWED]
-    if only_look:
+    if has_visual:
         viewed = [geom for geom in viewed if _is_visual(geom) or geom.get("group") != "0"]
     return viewed or list(geoms)
 
 
 def _renamed(element: ET.Element, prefix: str) -> ET.Element:
-    """A copy of an element and its children in which every name begins with ``prefix``."""
+    """Copy an element and its children, and put ``prefix`` before every name."""
     renamed = copy.deepcopy(element)
     renamed.tail = None
     for part in renamed.iter():
@@ -260,8 +284,9 @@ def _renamed(element: ET.Element, prefix: str) -> ET.Element:
 
 
 def _points(model: Any, data: Any, geom: int) -> Any:
-    """(N, 3) world points whose bounds are the geom's: a mesh's vertices, else the corners of its own box."""
-    if (mesh := model.geom_dataid[geom]) >= 0:
+    """Return world points (N, 3) with the bounds of a geom: a mesh's vertices, else the corners of the geom's box."""
+    mesh = model.geom_dataid[geom]
+    if mesh >= 0:
         start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         local = model.mesh_vert[start : start + count]
     else:

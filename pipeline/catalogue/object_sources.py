@@ -1,8 +1,8 @@
-"""What the sources of object models offer.
+"""Sources of object models, and the models that each source offers.
 
 ``libero`` and ``robosuite`` are installed with the pipeline. ``sweethome3d`` (Debian's package of furniture models, CC0
-and CC-BY) and a :class:`Folder` of the user's are converted into ``FOLDER`` when they are first needed. A converted
-model is kept until its origin or the conversion changes, so a conversion that was stopped goes on where it was.
+and CC-BY) and a user's :class:`Folder` are converted into ``FOLDER`` when they are first needed. A converted model is
+kept until its origin or the conversion changes, so an interrupted conversion resumes where it stopped.
 """
 
 import fcntl
@@ -34,20 +34,20 @@ Package = Literal["libero", "robosuite", "sweethome3d"]
 Source = Package | Folder
 
 FOLDER = Path("data/objects")
-"""Where converted models lie, one folder each: ``<source>/<name>/model.xml`` and ``about.json``."""
+"""Folder of converted models, one folder each: ``<source>/<name>/model.xml`` and ``about.json``."""
 AGAIN = "`python -m pipeline sources CONFIG`, which converts what is not there"
-"""What makes up for a converted model that is gone."""
+"""Words for error messages: the command that converts a missing model again."""
 CATALOGUE = Path(__file__).with_name("objects.yaml")
 
 LARGEST_M = 0.5
-"""What a user's model may measure in any direction: a larger one is not in metres, or of no use on a table."""
+"""Largest extent of a user's model in any direction: a larger model is not in metres, or too large for a table."""
 
 
 def offered(source: Source) -> Iterator[ObjectModel]:
-    """Every object of a source; what is not installed is fetched and converted first.
+    """Yield every object of a source; a source that is not installed is fetched and converted first.
 
     Raises:
-        PipelineError: when the source cannot be had, or a model cannot be converted.
+        PipelineError: when the source cannot be fetched or read, or a model cannot be converted.
     """
     match source:
         case "libero":
@@ -71,32 +71,42 @@ def offered(source: Source) -> Iterator[ObjectModel]:
 
 
 def converted(name: str) -> ObjectModel:
-    """The model that a conversion left under that name; nothing is fetched or converted.
+    """Return the converted model of the given name; nothing is fetched or converted.
 
     Raises:
-        PipelineError: when there is none.
+        PipelineError: when no such model was converted.
     """
-    if (about := _about(name)) is None:
+    about = _about(name)
+    if about is None:
         raise PipelineError(f"the object {name} is missing", where=FOLDER / name, remedy=f"run {AGAIN}")
     return ObjectModel(name, about["category"], about["licence"], about["attribution"], FOLDER / name / "model.xml")
 
 
 @cache
 def catalogue() -> dict[str, dict[str, Any]]:
-    """Package to category to the members that it holds."""
+    """Read ``objects.yaml``: package to category to the members of the category."""
     catalogue: dict[str, dict[str, Any]] = yaml.safe_load(CATALOGUE.read_text())
     return catalogue
 
 
 def _sweethome3d() -> Iterator[ObjectModel]:
-    wanted = {member: category for category, members in catalogue()["sweethome3d"].items() for member in members}
+    """Yield the objects of sweethome3d; missing or outdated models are converted first."""
+    wanted: dict[str, str] = {}
+    for category, members in catalogue()["sweethome3d"].items():
+        wanted |= dict.fromkeys(members, category)
     names = {member: f"sweethome3d/{member.replace('/', '_').lower()}" for member in wanted}
-    made_from = {
-        member: digest("object", RECIPE, sweethome3d.SHA256, member, category) for member, category in wanted.items()
-    }
+    made_from = {}
+    for member, category in wanted.items():
+        made_from[member] = digest("object", RECIPE, sweethome3d.SHA256, member, category)
 
     def missing() -> set[str]:
-        return {member for member in wanted if (_about(names[member]) or {}).get("made_from") != made_from[member]}
+        """Return the members that have no converted model, or one of another origin."""
+        outdated = set()
+        for member, name in names.items():
+            about = _about(name) or {}
+            if about.get("made_from") != made_from[member]:
+                outdated.add(member)
+        return outdated
 
     if missing():
         with _locked():
@@ -113,18 +123,17 @@ def _sweethome3d() -> Iterator[ObjectModel]:
                 }
                 with _made(names[piece.member], about) as folder, tempfile.TemporaryDirectory() as scratch:
                     convert(piece.unpack(Path(scratch)), folder, piece.size_m, piece.turn)
-            if absent := missing():
+            absent = missing()
+            if absent:
                 raise PipelineError(f"the package lacks {', '.join(sorted(absent))}", where=deb, remedy="report it")
     for name in names.values():
         yield converted(name)
 
 
 def _own(source: Folder) -> Iterator[ObjectModel]:
-    paths = sorted(
-        path
-        for path in source.folder.glob("*/*")
-        if path.suffix.lower() in (".obj", ".xml") and not path.name.startswith(".")
-    )
+    """Yield the objects of a user's folder; new or changed models are converted first."""
+    models = [path for path in source.folder.glob("*/*") if path.suffix.lower() in (".obj", ".xml")]
+    paths = sorted(path for path in models if not path.name.startswith("."))
     if not paths:
         raise PipelineError(
             "there are no models here",
@@ -141,12 +150,8 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
                 expected="what an instruction would call the objects, in small letters, such as bottle_of_milk",
                 remedy="rename the folder",
             )
-        # A model's materials and textures lie beside it.
-        beside = [file.relative_to(path.parent) for file in sorted(path.parent.rglob("*")) if file.is_file()]
-        shown = [file for file in beside if not any(part.startswith(".") for part in file.parts)]
-        content = [(file.as_posix(), checksum(path.parent / file)) for file in shown]
-        made_from = digest("object", RECIPE, path.name, content)
-        # The name holds a hash of what it was made from, so that an earlier plan still finds its own objects.
+        made_from = digest("object", RECIPE, path.name, _hashed_files(path.parent))
+        # The name holds a hash of the model's origin, so that an earlier plan still finds its own objects.
         name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
         about = {"made_from": made_from, "category": category, "licence": source.licence}
         about["attribution"] = f"{category}/{path.name}"
@@ -161,7 +166,22 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         yield converted(name)
 
 
+def _hashed_files(folder: Path) -> list[tuple[str, str]]:
+    """List the files of a folder and its subfolders with their hashes, in order of their paths.
+
+    A model's materials and textures are stored in the same folder as the model. Hidden files and folders are left out.
+    """
+    files = []
+    for file in sorted(folder.rglob("*")):
+        below = file.relative_to(folder)
+        hidden = any(part.startswith(".") for part in below.parts)
+        if file.is_file() and not hidden:
+            files.append((below.as_posix(), checksum(file)))
+    return files
+
+
 def _check_size(mjcf: Path, path: Path) -> None:
+    """Reject a user's model that is larger than ``LARGEST_M``; an error names it by ``path``."""
     low, high, _ = ObjectModel("", "", "", "", mjcf).shape
     longest = max(up - down for up, down in zip(high, low, strict=True))
     if longest > LARGEST_M:
@@ -174,17 +194,17 @@ def _check_size(mjcf: Path, path: Path) -> None:
 
 
 def _copy(mjcf: Path, out: Path) -> None:
-    """Copy a model with the files that it names, side by side."""
+    """Copy a model and the files that it names into one folder."""
     try:
         tree = ET.parse(mjcf)
         for number, asset in enumerate(tree.iterfind("asset/*[@file]")):
             file = (mjcf.parent / asset.attrib["file"]).resolve()
             if not file.is_relative_to(mjcf.parent.resolve()):
                 raise PipelineError(
-                    f"the file {asset.attrib['file']} lies elsewhere",
+                    f"the file {asset.attrib['file']} is outside of the model's folder",
                     where=mjcf,
-                    expected="files beside the model",
-                    remedy="copy it beside the model, and name it from there",
+                    expected="files in the model's folder, or below it",
+                    remedy="copy the file into the model's folder, and name it by its path from this folder",
                 )
             asset.set("name", asset_name(asset))
             asset.set("file", f"{number}{file.suffix}")
@@ -196,7 +216,10 @@ def _copy(mjcf: Path, out: Path) -> None:
 
 @contextmanager
 def _made(name: str, about: dict[str, str]) -> Iterator[Path]:
-    """The folder of a converted model, to be filled; it is complete or absent. Only while ``_locked``."""
+    """Open the folder of a converted model for writing; afterwards the folder is complete or absent.
+
+    The caller must hold ``_locked``.
+    """
     remove_leftovers((FOLDER / name).parent)
     with replaced(FOLDER / name) as folder:
         folder.mkdir()
@@ -205,6 +228,7 @@ def _made(name: str, about: dict[str, str]) -> Iterator[Path]:
 
 
 def _about(name: str) -> dict[str, str] | None:
+    """Read ``about.json`` of a converted model; return `None` if there is no such model."""
     try:
         about: dict[str, str] = json.loads((FOLDER / name / "about.json").read_text())
     except FileNotFoundError:
@@ -214,7 +238,7 @@ def _about(name: str) -> dict[str, str] | None:
 
 @contextmanager
 def _locked() -> Iterator[None]:
-    """Let one process convert at a time; the next one finds the models converted."""
+    """Let only one process convert at a time; the next process finds the models converted."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     with (FOLDER / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -1,4 +1,4 @@
-"""Small objects that can be added to a scene: of no category of the test set's, with nouns that cannot be confused."""
+"""Small objects that can be added to a scene: no category of the test set's, and nouns that cannot be confused."""
 
 import re
 from functools import cache
@@ -16,23 +16,28 @@ TEST_CATEGORIES = frozenset(
         *("box_of_yogurt", "boxed_ink_cartridge", "can_of_sardines", "can_of_soda", "canned_food"),
     }
 )
-"""What LIBERO-Plus's test tasks add (its ``<base>_add_<n>.bddl``, without the ``__1`` that some names end in)."""
+"""Categories of objects that LIBERO-Plus's test tasks add.
+
+They come from its ``<base>_add_<n>.bddl``, without the ``__1`` that some names end in.
+"""
 
 
 ALIKE = ({"bowl", "ramekin", "ashtray"}, {"mug", "glass", "measure", "creamer"}, {"pot", "teapot", "kettle"})
-"""Groups of nouns whose objects look alike, judged by looking at the models."""
+"""Groups of nouns whose objects look alike, judged from the models by eye."""
 
 
 @cache
 def models(sources: tuple[Source, ...]) -> dict[str, ObjectModel]:
-    """The objects of these sources, by name, in a fixed order.
+    """Collect the objects of some sources: name to object, sorted by name.
 
-    What is not installed is fetched and converted first, which a plan does once, before its first draw.
+    Sources that are not installed are fetched and converted first. A plan does this once, before it samples anything.
 
     Raises:
-        PipelineError: when a source cannot be had, or holds what must not be added.
+        PipelineError: when a source cannot be fetched or read, or has an object of the test set's categories.
     """
-    members = [model for source in sources for model in offered(source)]
+    members: list[ObjectModel] = []
+    for source in sources:
+        members += offered(source)
     for model in members:
         if model.category in TEST_CATEGORIES:
             raise PipelineError(
@@ -44,10 +49,12 @@ def models(sources: tuple[Source, ...]) -> dict[str, ObjectModel]:
 
 
 def find(name: str, sha256: str) -> ObjectModel:
-    """The object of that name and content; nothing is fetched or converted, as many workers may ask at once.
+    """Return the object of the given name and content.
+
+    Nothing is fetched or converted, because many workers may call this function at once.
 
     Raises:
-        PipelineError: when it is not here, or not the one that was recorded.
+        PipelineError: when the object is missing, or its content differs from the recorded hash.
     """
     installed = models(("libero", "robosuite")).get(name)
     model = installed or converted(name)
@@ -61,33 +68,41 @@ def find(name: str, sha256: str) -> ObjectModel:
 
 
 def category_in(model_type: str) -> str:
-    """The category of one of LIBERO's types, such as ``bowl`` for ``akita_black_bowl``; itself when it has none."""
+    """Return the category of one of LIBERO's types, such as ``bowl`` for ``akita_black_bowl``.
+
+    A type without a category is its own category.
+    """
     for category, members in catalogue()["libero"].items():
-        if any(member.rpartition("/")[2] == model_type for member in members):
+        types = [member.rpartition("/")[2] for member in members]
+        if model_type in types:
             return str(category)
     return model_type
 
 
 @cache
 def taken(task: Task) -> frozenset[str]:
-    """Categories that are in a task's scene, and words that its scene and instruction use."""
+    """Return the categories in a task's scene, and the words that its scene and instruction use."""
     scene = bddl.read(task.bddl_file)
     types = [*scene.objects.values(), *scene.fixtures.values()]
-    return frozenset(map(category_in, types)) | words_in(" ".join([*types, task.instruction]).replace("_", " "))
+    categories = frozenset(map(category_in, types))
+    text = " ".join([*types, task.instruction]).replace("_", " ")
+    return categories | words_in(text)
 
 
 def words_in(text: str) -> frozenset[str]:
-    """The words of a text in lower case, those that end in s without it too."""
+    """Return the words of a text in lower case; words that end in s are included without the s too."""
     words = re.findall(r"[a-z]+", text.lower())
-    return frozenset({*words, *(word.removesuffix("s") for word in words)})
+    singulars = [word.removesuffix("s") for word in words]
+    return frozenset({*words, *singulars})
 
 
 def goes_with(model: ObjectModel, names: frozenset[str]) -> bool:
-    """Whether an object is of another category than everything in ``names``, and cannot be meant by another's noun."""
+    """Return whether no name in ``names`` is an object's category, its noun, or the noun of a similar object."""
     return not nouns_of(model.category) & names
 
 
 def nouns_of(category: str) -> frozenset[str]:
-    """A category, its noun, and the nouns of objects that look alike."""
+    """Return a category, its noun, and the nouns of objects that look alike."""
     noun = category.split("_of_")[0].split("_")[-1]
-    return frozenset({category, noun}).union(*(alike for alike in ALIKE if noun in alike))
+    groups = [alike for alike in ALIKE if noun in alike]
+    return frozenset({category, noun}).union(*groups)

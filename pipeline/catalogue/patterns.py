@@ -1,4 +1,4 @@
-"""What procedural images are made of: periodic noise, places, colours and cells, so that they tile without a seam."""
+"""Building blocks of procedural images: periodic noise, places, colours and cells, which tile without a seam."""
 
 import colorsys
 from functools import cache
@@ -17,17 +17,18 @@ Colour = NDArray[np.float64]
 
 @cache
 def frequency() -> tuple[Floats, Floats]:
-    """Whole cycles per image along rows (512, 1) and columns (1, 257), in the order of ``rfft2``."""
+    """Return whole cycles per image along rows (512, 1) and columns (1, 257), in the order of ``rfft2``."""
     down, right = np.fft.fftfreq(SIDE_PX, 1 / SIDE_PX), np.fft.rfftfreq(SIDE_PX, 1 / SIDE_PX)
     return np.asarray(down, np.float64)[:, None], np.asarray(right, np.float64)[None]
 
 
 def relief(rng: Rng, roughness: float, stretch: tuple[float, float] = (1, 1), coarsest: float = 1) -> Floats:
-    """Fractal noise (512, 512) of mean 0 and deviation 1.
+    """Generate fractal noise (512, 512) with mean 0 and standard deviation 1.
 
     Args:
+        rng: source of random numbers.
         roughness: exponent of the amplitude spectrum, 0 for white noise; about 1 gives clouds, 2 soft hills.
-        stretch: length of its features down and to the right, relative to that of round ones.
+        stretch: length of the features down and to the right, relative to the length of round features.
         coarsest: lowest frequency with full amplitude, in cycles per image.
     """
     down, right = frequency()
@@ -39,18 +40,19 @@ def relief(rng: Rng, roughness: float, stretch: tuple[float, float] = (1, 1), co
 
 
 def grid() -> tuple[Floats, Floats]:
-    """Place of the pixels' centres, down (512, 1) and right (1, 512), in [0, 1]."""
+    """Return the place of the pixels' centres, down (512, 1) and right (1, 512), in [0, 1]."""
     place = (np.arange(SIDE_PX) + 0.5) / SIDE_PX
     return place[:, None], place[None]
 
 
 def colour(rng: Rng, hue: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]) -> Colour:
+    """Sample a colour whose hue, saturation and value are uniform in the given intervals; hues are modulo 1."""
     h, s, v = (rng.uniform(*interval) for interval in (hue, saturation, value))
     return np.array(colorsys.hsv_to_rgb(h % 1, s, v))
 
 
 def mix(low: Colour, high: Colour, share: Floats) -> Floats:
-    """(512, 512, 3) between two colours; ``share`` (512, 512) is cut to [0, 1]."""
+    """Mix two colours to an image (512, 512, 3); the share (512, 512) of ``high`` is clipped to [0, 1]."""
     t = share.clip(0, 1)[..., None]
     return np.asarray(low * (1 - t) + high * t)
 
@@ -58,12 +60,12 @@ def mix(low: Colour, high: Colour, share: Floats) -> Floats:
 def cells(
     rng: Rng, rows: int, columns: int, joint: float, offset: float
 ) -> tuple[Floats, NDArray[np.intp], tuple[Floats, Floats]]:
-    """A wall of rectangular cells, every second row shifted by ``offset`` of a cell.
+    """Divide an image into a wall of rectangular cells, every second row shifted by ``offset`` of a cell.
 
     Returns:
-        Distance to the joint between cells, 0 in the joint and 1 within, softened over a pixel or two (512, 512);
-        the number of the cell that each pixel belongs to; and the place of each pixel with its cell's own shift,
-        for patterns that differ from cell to cell.
+        Three values for each pixel. First the distance to the joint between cells (512, 512): 0 in the joint, 1 within
+        a cell, softened over a pixel or two. Then the number of the pixel's cell. Last the place of the pixel,
+        moved by a random shift of its cell, for patterns that differ from cell to cell.
     """
     down, right = grid()
     row = np.floor(down * rows).astype(np.intp)

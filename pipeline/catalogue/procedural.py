@@ -1,7 +1,7 @@
 """Procedural surfaces: seamless colour maps and data maps, with any number of textures in each family.
 
-A texture is determined by its family and index and :data:`RECIPE` alone, and nothing but NumPy makes it, in about
-0.1 s. The data maps are in :mod:`pipeline.catalogue.data_maps`.
+A texture depends on its family, its index and :data:`RECIPE` alone. NumPy generates it in about 0.1 s. The data maps
+are in :mod:`pipeline.catalogue.data_maps`.
 """
 
 from collections.abc import Callable
@@ -14,17 +14,17 @@ from pipeline.catalogue.patterns import Rng, cells, colour, grid, mix, relief
 from pipeline.types import Floats, Frame
 
 RECIPE = 1
-"""Raise it whenever a change here changes pixels: it is part of every texture's hash."""
+"""Number to raise whenever a change here changes pixels: it is part of every texture's hash."""
 
 
 def texture(family: str, index: int) -> Frame:
-    """(512, 512, 3) RGB of one texture of a family."""
+    """Generate the RGB image (512, 512, 3) of one texture of a family."""
     image = FAMILIES[family](seeding.rng("texture", RECIPE, family, index))
     return np.asarray(np.rint(image.clip(0.03, 0.94) * 255), np.uint8)
 
 
 def _wood(rng: Rng) -> Floats:
-    """Boards or one sheet: long fibres, and year rings that the warp of the trunk bends."""
+    """Generate wood, as boards or one sheet: long fibres, and year rings that the warp of the trunk bends."""
     light = colour(rng, (0.045, 0.11), (0.2, 0.65), (0.35, 0.9))
     if rng.random() < 0.2:  # painted or stained
         light = colour(rng, (0, 1), (0.1, 0.5), (0.35, 0.8))
@@ -44,7 +44,7 @@ def _wood(rng: Rng) -> Floats:
 
 
 def _stone(rng: Rng) -> Floats:
-    """Marble with veins, or speckled granite."""
+    """Generate marble with veins, or speckled granite."""
     base = colour(rng, (0, 1), (0.0, 0.18), (0.3, 0.9))
     if rng.random() < 0.5:
         cloud, fold = relief(rng, 1.3), relief(rng, rng.uniform(1.2, 1.6))
@@ -62,7 +62,7 @@ def _stone(rng: Rng) -> Floats:
 
 
 def _tile(rng: Rng) -> Floats:
-    """Square or oblong glazed tiles with grout, plain or in a chequered pair of colours."""
+    """Generate square or oblong glazed tiles with grout, plain or in a chequered pair of colours."""
     rows = int(rng.choice([2, 3, 4, 6, 8, 12]))
     columns = rows if rng.random() < 0.7 else max(1, rows // 2)
     offset = 0.5 if columns != rows and rows % 2 == 0 else 0.0
@@ -80,7 +80,7 @@ def _tile(rng: Rng) -> Floats:
 
 
 def _brick(rng: Rng) -> Floats:
-    """Running bond; each brick has its own tone and a rough face."""
+    """Generate bricks in running bond; each brick has its own tone and a rough face."""
     columns = int(rng.choice([2, 3, 4, 5]))
     inside, number, (y, x) = cells(rng, 2 * columns + 2 * int(rng.integers(0, 2)), columns, 0.016, 0.5)
     brick = colour(rng, (-0.02, 0.09), (0.15, 0.65), (0.35, 0.85))
@@ -94,7 +94,7 @@ def _brick(rng: Rng) -> Floats:
 
 
 def _plaster(rng: Rng) -> Floats:
-    """Painted plaster: stains over metres, the trowel's strokes, and grain."""
+    """Generate painted plaster: stains over metres, the trowel's strokes, and grain."""
     paint = colour(rng, (0, 1), (0.02, 0.35), (0.4, 0.9))
     stains = rng.uniform(0.005, 0.035) * relief(rng, 1.5)
     strokes = rng.uniform(0.01, 0.06) * relief(rng, 1.1, (1, float(rng.uniform(1, 4))), 10)
@@ -103,7 +103,7 @@ def _plaster(rng: Rng) -> Floats:
 
 
 def _fabric(rng: Rng) -> Floats:
-    """Plain weave of uneven threads, of one colour, striped or chequered."""
+    """Generate a plain weave of uneven threads, of one colour, striped or chequered."""
     down, right = grid()
     threads = int(rng.choice([48, 64, 96]))
     ground = colour(rng, (0, 1), (0.05, 0.65), (0.25, 0.85))
@@ -123,7 +123,7 @@ def _fabric(rng: Rng) -> Floats:
 
 
 def _metal(rng: Rng) -> Floats:
-    """Brushed, or dull with scratches and patina; steel, brass, copper or anodised."""
+    """Generate metal, brushed, or dull with scratches and patina: steel, brass, copper or anodised."""
     hue = float(rng.choice([0.58, 0.58, 0.12, 0.05, rng.random()]))
     metal = colour(rng, (hue - 0.02, hue + 0.02), (0.03, 0.12) if hue == 0.58 else (0.2, 0.5), (0.35, 0.8))
     patina = rng.uniform(0.005, 0.05) * relief(rng, 1.5)

@@ -1,8 +1,8 @@
-"""The files that a scene's model names, under names that hold on every machine.
+"""Portable names of the files that a scene's model uses.
 
-MuJoCo opens meshes and images by absolute path, so a model that is to be compiled has those of this machine. What is
-stored has, in their place, where a file belongs: in a package, as ``pipeline.libero.assets`` names it, or in the folder
-of converted objects, and then with a hash, as an object may be converted anew.
+MuJoCo opens meshes and images by absolute path, so a model that is to be compiled has the paths of this machine. A
+stored model has portable names instead. A file of a package has its name in ``pipeline.libero.assets``. A file of a
+converted object has its path in the folder of converted objects and a hash, because an object may be converted again.
 """
 
 import html
@@ -17,16 +17,16 @@ from pipeline.files import checksum
 from pipeline.libero.assets import installed, name_of
 
 _OBJECTS, _HASH = "objects/", "#sha256="
-# As ElementTree writes attributes; besides file, a cube texture has fileright, fileleft and so on. The pattern begins
-# with letters, so that searching takes a tenth of the time.
+# The pattern matches attributes in ElementTree's notation. Besides file, a cube texture has fileright, fileleft and so
+# on. The pattern begins with letters, so that searching takes a tenth of the time.
 _FILE = re.compile(r'(file(?<=\sfile)\w*)="([^"]*)"')
 
 
 def portable(model_xml: str) -> str:
-    """A scene's MJCF with names in place of this machine's paths; nothing else changes.
+    """Replace this machine's paths in a scene's MJCF by portable names; nothing else changes.
 
     Raises:
-        PipelineError: when it uses a file that is neither installed nor of a converted object.
+        PipelineError: when the scene uses a file that belongs neither to a package nor to a converted object.
     """
     return _each_file(model_xml, _named)
 
@@ -35,23 +35,29 @@ def located(model_xml: str, where: object) -> str:
     """Undo ``portable``, on any machine that has the same packages and objects.
 
     Args:
-        where: what to call the model in errors.
+        model_xml: a scene's MJCF with portable names.
+        where: name of the model for error messages.
 
     Raises:
-        PipelineError: when a file is not here, or is another one.
+        PipelineError: when a file is missing, or has another hash.
     """
     return _each_file(model_xml, lambda name: _found(name, where))
 
 
 def _each_file(model_xml: str, change: Callable[[str], str]) -> str:
+    """Apply ``change`` to the value of every file attribute of a scene's MJCF."""
+
     def changed(match: re.Match[str]) -> str:
-        return f'{match[1]}="{escape(change(html.unescape(match[2])), {chr(34): "&quot;"})}"'
+        file = change(html.unescape(match[2]))
+        return f'{match[1]}="{escape(file, {chr(34): "&quot;"})}"'
 
     return _FILE.sub(changed, model_xml)
 
 
 def _named(path: str) -> str:
-    if (name := name_of(path)) is not None:
+    """Return the portable name of a path of this machine."""
+    name = name_of(path)
+    if name is not None:
         return name
     file, converted = Path(path), object_sources.FOLDER.resolve()
     if not file.is_relative_to(converted):
@@ -64,6 +70,7 @@ def _named(path: str) -> str:
 
 
 def _found(name: str, where: object) -> str:
+    """Return this machine's path of a portable name, and check the hash of an object's file."""
     if not name.startswith(_OBJECTS):
         try:
             return installed(name)

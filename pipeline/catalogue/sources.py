@@ -1,4 +1,4 @@
-"""A folder of the user's own as a source, of textures or of object models."""
+"""A user's folder as a source of textures or of object models."""
 
 from pydantic import BaseModel
 

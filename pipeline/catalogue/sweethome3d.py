@@ -24,7 +24,7 @@ LICENCES = {
     "KatorLegaz": "CC-BY-3.0-US",
     "Scopia": "CC-BY-3.0",
 }
-"""Of each library of the package, as its copyright file has them."""
+"""Library of the package to its licence, according to the package's copyright file."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Piece:
     """One model of the package.
 
     Attributes:
-        member: ``<library>/<model>``, what it is called by here.
-        title, creator: as its library names them.
+        member: ``<library>/<model>``, the name of the model in this project.
+        title, creator: names that the library states.
         licence: SPDX identifier.
         size_m: real width, depth and height.
-        turn: (3, 3) rotation that the model needs before it is measured, or None.
+        turn: (3, 3) rotation that the model needs before it is measured, or `None`.
     """
 
     member: str
@@ -49,17 +49,18 @@ class Piece:
     _archive: zipfile.ZipFile
 
     def unpack(self, folder: Path) -> Path:
-        """Write the model with its materials and textures; returns its OBJ file."""
-        beside = f"{Path(self._obj).parent}/"
-        self._archive.extractall(folder, [file for file in self._archive.namelist() if file.startswith(beside)])
+        """Write the model with its materials and textures into a folder; return its OBJ file."""
+        same_folder = f"{Path(self._obj).parent}/"
+        files = [file for file in self._archive.namelist() if file.startswith(same_folder)]
+        self._archive.extractall(folder, files)
         return folder / self._obj
 
 
 def fetch(folder: Path) -> Path:
-    """The package's file in ``folder``, downloaded by apt from the machine's own mirror unless it is there.
+    """Fetch the package's file into ``folder`` unless it exists, by apt from the machine's own mirror.
 
     Raises:
-        PipelineError: when it cannot be downloaded, or is not the package that the catalogue was made for.
+        PipelineError: when the file cannot be downloaded, or is not the package that the catalogue was written for.
     """
     remedy = (
         f"`sudo apt-get update`, and run it again; or put {DEB} of Debian 12 there; or leave sweethome3d out of "
@@ -70,31 +71,36 @@ def fetch(folder: Path) -> Path:
 
 
 def pieces(deb: Path) -> Iterator[Piece]:
-    """Every model of the package."""
+    """Yield every model of the package."""
     for library, archive in _libraries(deb):
         for entry in _entries(archive.read("PluginFurnitureCatalog.properties").decode("latin-1")):
             width, depth, height = (float(entry[side]) / 100 for side in ("width", "depth", "height"))
+            turn = None
+            if "modelRotation" in entry:
+                turn = np.array(entry["modelRotation"].split(), float).reshape(3, 3)
             yield Piece(
                 member=f"{library}/{Path(entry['model']).stem}",
                 title=entry["name"],
                 creator=entry.get("creator", library),
                 licence=LICENCES[library],
                 size_m=(width, depth, height),
-                turn=np.array(entry["modelRotation"].split(), float).reshape(3, 3)
-                if "modelRotation" in entry
-                else None,
+                turn=turn,
                 _obj=entry["model"].lstrip("/"),
                 _archive=archive,
             )
 
 
 def _libraries(deb: Path) -> Iterator[tuple[str, zipfile.ZipFile]]:
-    """The libraries of a Debian package of furniture: an ``ar`` archive with a tar file of zip files in it."""
+    """Yield the libraries of a Debian package of furniture: an ``ar`` archive with a tar file of zip files in it."""
     content = deb.read_bytes()
-    at = len("!<arch>\n")
-    while not (header := content[at : at + 60]).startswith(b"data.tar"):
-        at += 60 + int(header[48:58]) + int(header[48:58]) % 2
-    with tarfile.open(fileobj=io.BytesIO(content[at + 60 : at + 60 + int(header[48:58])])) as data:
+    # Each member of the archive has a header of 60 bytes, which states its size; members begin at even places.
+    start = len("!<arch>\n")
+    while not (header := content[start : start + 60]).startswith(b"data.tar"):
+        size = int(header[48:58])
+        start += 60 + size + size % 2
+    first = start + 60
+    data_tar = content[first : first + int(header[48:58])]
+    with tarfile.open(fileobj=io.BytesIO(data_tar)) as data:
         for library in LICENCES:
             file = data.extractfile(f"./usr/share/sweethome3d/furniture/{library}.sh3f")
             if file is not None:
@@ -102,8 +108,15 @@ def _libraries(deb: Path) -> Iterator[tuple[str, zipfile.ZipFile]]:
 
 
 def _entries(text: str) -> Iterator[dict[str, str]]:
-    """The pieces of a catalogue, a Java properties file of ``<property>#<number>``, numbered from 1."""
-    lines = re.findall(r"^\s*([^#!=:\s][^=:\s]*)\s*[=:]\s*(.*?)\s*$", re.sub(r"\\\r?\n\s*", "", text), re.MULTILINE)
-    listed = {key: re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value) for key, value in lines}
+    """Yield the pieces of a catalogue: a Java properties file of ``<property>#<number>``, numbered from 1.
+
+    A piece is a dictionary of property to value.
+    """
+    joined = re.sub(r"\\\r?\n\s*", "", text)
+    lines = re.findall(r"^\s*([^#!=:\s][^=:\s]*)\s*[=:]\s*(.*?)\s*$", joined, re.MULTILINE)
+    listed = {}
+    for key, value in lines:
+        listed[key] = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value)
     for number in takewhile(lambda number: f"id#{number}" in listed, count(1)):
-        yield {key.rpartition("#")[0]: value for key, value in listed.items() if key.endswith(f"#{number}")}
+        end = f"#{number}"
+        yield {key.rpartition("#")[0]: value for key, value in listed.items() if key.endswith(end)}

@@ -1,8 +1,8 @@
-"""What the sources of textures offer, whether or not it may be drawn.
+"""Sources of textures, and all textures that each source offers, including textures that must not be sampled.
 
-``robosuite``, ``libero`` and ``procedural`` need nothing but what is installed; ``metaworld`` and
-``gymnasium-robotics`` are wheels of the Python package index, fetched when first asked for and read as archives; a
-:class:`Folder` holds the user's own images.
+``robosuite``, ``libero`` and ``procedural`` are installed with the pipeline. ``metaworld`` and ``gymnasium-robotics``
+are wheels of the Python package index, fetched when they are first needed and read as archives. A :class:`Folder`
+holds the user's own images.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ Package = Literal["libero", "robosuite", "procedural", "metaworld", "gymnasium-r
 Source = Package | Folder
 
 FOLDER = Path("data/textures")
-"""Where the wheels are kept, and what was drawn of a user's images: ``own/<SHA-256>``."""
+"""Folder of the wheels, and of copies of the user's images that were sampled: ``own/<SHA-256>``."""
 
 PROCEDURAL_PER_FAMILY = 60
 
@@ -58,7 +58,7 @@ _LICENCES = {
     "gymnasium-robotics": "MIT, parts Apache-2.0 (gymnasium-robotics)",
 }
 LARGEST_PX = 64_000_000
-"""Of an image, 8,000 pixels square."""
+"""Largest number of pixels of an image: 8,000 pixels square."""
 
 REPLACE = "replace it or take it away"
 
@@ -70,14 +70,14 @@ class Texture:
     """One image of a surface.
 
     Attributes:
-        name: ``<source>:<file>``, ``procedural:<family>/<index>`` or ``folder:<start of the hash>/<file>``; with the
-            hash enough to find it again, and no path of this machine.
+        name: ``<source>:<file>``, ``procedural:<family>/<index>`` or ``folder:<start of the hash>/<file>``. It holds no
+            path of this machine. Name and hash are enough to find the texture again.
         source: the part of the name before the colon, ``folder`` for a user's file.
-        licence: as its source states it.
-        sha256: of the image file; of the recipe (generator's version, family, index) of a procedural one, so that
-            rounding on another processor does not make it another texture.
-        load: gives (H, W, 3) RGB, or a PipelineError when the file is gone or no image.
-        own: the file, where it is a user's.
+        licence: licence that the source states.
+        sha256: hash of the image file. A procedural texture has the hash of its recipe (generator's version, family,
+            index), so that rounding on another processor does not make it another texture.
+        load: function that returns (H, W, 3) RGB; it raises a PipelineError when the file is missing or no image.
+        own: the file of a user's image.
     """
 
     name: str
@@ -89,15 +89,17 @@ class Texture:
 
     @property
     def family(self) -> str | None:
-        """Of :data:`pipeline.catalogue.procedural.FAMILIES`; None for an image."""
-        return self.name.partition(":")[2].partition("/")[0] if self.source == "procedural" else None
+        """Family of a procedural texture in :data:`pipeline.catalogue.procedural.FAMILIES`; `None` for an image."""
+        if self.source != "procedural":
+            return None
+        return self.name.partition(":")[2].partition("/")[0]
 
 
 def offered(source: Source) -> Iterator[Texture]:
-    """Every image of a source, in a fixed order.
+    """Yield every image of a source, in a fixed order.
 
     Raises:
-        PipelineError: when the source cannot be had.
+        PipelineError: when the source cannot be fetched or read.
     """
     match source:
         case Folder():
@@ -128,17 +130,18 @@ def offered(source: Source) -> Iterator[Texture]:
             without = f"leave {source} out of plan.axes.background.sources"
             path = fetch_wheel(WHEELS[source], FOLDER, without)
             with zipfile.ZipFile(path) as archive:
-                for member in sorted(name for name in archive.namelist() if name.lower().endswith(_IMAGES)):
+                members = sorted(member for member in archive.namelist() if member.lower().endswith(_IMAGES))
+                for member in members:
                     name = f"{source}:{member.partition('/assets/')[2].replace('textures/', '')}"
                     sha256 = hashlib.sha256(archive.read(member)).hexdigest()
                     yield Texture(name, source, _LICENCES[source], sha256, partial(_member, path, member))
 
 
 def from_file(name: str, file: Path, licence: str) -> Texture:
-    """The texture that an image file is.
+    """Return the texture of an image file.
 
     Raises:
-        PipelineError: when it cannot be read.
+        PipelineError: when the file cannot be read.
     """
     try:
         sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -148,17 +151,17 @@ def from_file(name: str, file: Path, licence: str) -> Texture:
 
 
 def keep(texture: Texture) -> None:
-    """Copy a user's image to where ``kept`` finds it, whatever becomes of the folder."""
+    """Copy a user's image into ``FOLDER``, where ``kept`` finds it even if the user's folder changes."""
     copy = FOLDER / "own" / texture.sha256
     if texture.own is not None and not copy.exists():
         write(copy, texture.own.read_bytes())
 
 
 def kept(name: str, sha256: str) -> Texture:
-    """A user's image that was drawn.
+    """Return a user's image that was sampled, from its copy.
 
     Raises:
-        PipelineError: when it is not here, or damaged.
+        PipelineError: when the copy is missing or damaged.
     """
     file = FOLDER / "own" / sha256
     texture = from_file(name, file, "the folder's") if file.is_file() else None
@@ -173,24 +176,27 @@ def kept(name: str, sha256: str) -> Texture:
 
 @cache
 def libero_images() -> tuple[Path, ...]:
-    """LIBERO's images of walls, floors and tables."""
+    """List LIBERO's images of walls, floors and tables."""
     return _images(libero_assets() / "textures")
 
 
 def _member(wheel: Path, member: str) -> Frame:
+    """Read an image (H, W, 3) from a wheel."""
     with zipfile.ZipFile(wheel) as archive:
         return _decode(archive.read(member), member)
 
 
 def _images(root: Path) -> tuple[Path, ...]:
+    """List the PNG and JPEG files in a folder and its subfolders, sorted."""
     return tuple(sorted(file for file in root.rglob("*") if file.suffix.lower() in _IMAGES))
 
 
 def _decode(content: bytes, where: object) -> Frame:
-    import cv2  # takes long, and every process of a run imports the axes
+    """Decode an image (H, W, 3); an error names it by ``where``."""
+    import cv2  # imported here because it takes long, and every process of a run imports the axes
 
     try:
-        # Reads the header only: a small file may hold more pixels than fit into memory.
+        # Read the header first: a small file may hold more pixels than fit into memory.
         with Image.open(io.BytesIO(content)) as header:
             width_px, height_px = header.size
         if width_px * height_px > LARGEST_PX:

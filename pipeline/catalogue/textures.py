@@ -1,5 +1,7 @@
-"""The surfaces that may be drawn, with name, licence and hash: images that are colour maps and whatever is procedural,
-and none that the benchmark shows."""
+"""Textures that may be sampled, with name, licence and hash: colour maps and procedural textures.
+
+No image that the benchmark shows is among them.
+"""
 
 import re
 from functools import cache, lru_cache
@@ -23,10 +25,13 @@ IN_TEST_SET = frozenset(
 """Images of LIBERO that LIBERO-Plus's test tasks show (floors, then walls; its `arenas/style.py`), without ending."""
 
 _LIBERO_FREE = ("kona_gotham.png", "meeka-beige-plaster.png", "table_light_wood.png")
-"""Of LIBERO's ten images that no test task names, these remain. `tile_grigia_caldera_porcelain_floor` and
-`smooth_light_gray_plaster` are byte for byte the test set's light-gray-floor-tile and light-gray-plaster,
-`grigia_caldera_porcelain_floor`, `light_gray_plaster`, `light_grey_plaster` and `new_light_gray_plaster` differ from
-them by 0.1 to 2.3 grey levels, and `martin_novak_wood_table` is the table as it is."""
+"""Images of LIBERO that may be sampled: three of the ten that no test task names.
+
+`tile_grigia_caldera_porcelain_floor` and `smooth_light_gray_plaster` are byte for byte the test set's
+light-gray-floor-tile and light-gray-plaster. `grigia_caldera_porcelain_floor`, `light_gray_plaster`,
+`light_grey_plaster` and `new_light_gray_plaster` differ from these two by 0.1 to 2.3 grey levels.
+`martin_novak_wood_table` is the image of the unperturbed table.
+"""
 
 _NOT_SURFACES = frozenset(
     {
@@ -37,27 +42,29 @@ _NOT_SURFACES = frozenset(
 """Skins of single objects among the packages' textures, by normalised name."""
 
 _RECOLOURED = frozenset({"robosuite:yellow-plaster.png"})
-"""Walls of test tasks in another colour: a thumbnail's correlation with that of ``cream-plaster`` is 0.95; of the other
-packages' images the likest comes to 0.74 with a test image."""
+"""Walls of test tasks in another colour: their thumbnail's correlation with the thumbnail of ``cream-plaster`` is 0.95.
+
+The most similar other image of the packages has a correlation of 0.74 with a test image.
+"""
 
 _DATA_MAP = re.compile(
     r"(?:^|[-_ ])(ao|alpha\w*|bump|disp|displacement|gloss|height|metalness|nor|norm|normal|nrm|objectid|opacity|refl"
     r"|reflection|rough|roughness|spec|specular)(?=[-_ .]|$)",
     re.IGNORECASE,
 )
-"""Names of maps that say how a surface reflects or where it rises, not what colour it has."""
+"""Pattern in the names of data maps, which hold a surface's reflection or relief instead of its colour."""
 
 
 @cache
 def normalise(name: str) -> str:
-    """What two image files are compared by: the name without folders, ending, case and kind of separator."""
+    """Normalise the name of an image file for comparisons: remove folders, ending, case and kind of separator."""
     stem = re.sub(r"\.(png|jpe?g)$", "", re.split(r"[/\\:]", name)[-1], flags=re.IGNORECASE)
     return re.sub(r"[^a-z0-9]+", "-", stem.lower()).strip("-")
 
 
 @cache
 def test_images() -> frozenset[str]:
-    """SHA-256 of LIBERO's images that test tasks show."""
+    """Return the SHA-256 of each of LIBERO's images that test tasks show."""
     return frozenset(checksum(file) for file in libero_images() if file.stem in IN_TEST_SET)
 
 
@@ -65,7 +72,7 @@ test_images.__test__ = False  # type: ignore[attr-defined]  # not a test case, w
 
 
 def refusal(name: str, sha256: str) -> str | None:
-    """Why an image must not be drawn; None when it may."""
+    """Return the reason why an image must not be sampled; `None` if it may be sampled."""
     if sha256 in test_images():
         return "its bytes are those of an image that test tasks show"
     if normalise(name) in {normalise(used) for used in IN_TEST_SET}:
@@ -77,12 +84,13 @@ def refusal(name: str, sha256: str) -> str | None:
 
 @cache
 def catalogue(sources: tuple[Source, ...]) -> dict[str, Texture]:
-    """Every texture that the sources offer, by name, each content once and none that the test set shows.
+    """Collect the textures of some sources that may be sampled: name to texture, each content once.
 
-    What is not installed is fetched first.
+    Sources that are not installed are fetched first.
 
     Raises:
-        PipelineError: when a source cannot be had, or a user's folder holds what must not be drawn.
+        PipelineError: when a source cannot be fetched or read, or a user's folder holds an image that must not be
+            sampled.
     """
     by_name: dict[str, Texture] = {}
     seen: set[str] = set()
@@ -95,10 +103,10 @@ def catalogue(sources: tuple[Source, ...]) -> dict[str, Texture]:
 
 
 def find(name: str, sha256: str) -> Texture:
-    """The texture that an episode recorded.
+    """Return the texture that an episode recorded.
 
     Raises:
-        PipelineError: when it is not there, or has changed since.
+        PipelineError: when the texture is missing, or its content differs from the recorded hash.
     """
     source = name.partition(":")[0]
     texture = kept(name, sha256) if source == "folder" else None
@@ -113,21 +121,25 @@ def find(name: str, sha256: str) -> Texture:
 
 @lru_cache(maxsize=8)
 def pixels(name: str, sha256: str) -> Frame:
-    """(H, W, 3) RGB of a recorded texture; read-only, as it is shared."""
+    """Return (H, W, 3) RGB of a recorded texture; the array is shared, and therefore read-only."""
     image = find(name, sha256).load()
     image.setflags(write=False)
     return image
 
 
 def _may_be_drawn(texture: Texture, source: Source) -> bool:
-    """Whether a package's image is one to draw; a user's must be."""
+    """Return whether a package's image may be sampled.
+
+    Raises:
+        PipelineError: when a user's image may not be sampled, or is not readable.
+    """
     reason = refusal(texture.name, texture.sha256)
     if isinstance(source, Folder):
         if reason is not None:
             raise PipelineError(
                 f"this image cannot be used: {reason}", where=texture.own, remedy="move it out of the folder"
             )
-        texture.load()  # a file that is not an image is reported now, not when it is rendered
+        texture.load()  # reports a file that is not an image now, not when it is rendered
         return True
     if texture.source == "libero":
         return texture.name.removeprefix("libero:") in _LIBERO_FREE

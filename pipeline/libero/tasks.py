@@ -1,4 +1,4 @@
-"""LIBERO's task list, and tasks of one's own beside it."""
+"""LIBERO's task list, and the user's own tasks in addition to it."""
 
 import difflib
 import fnmatch
@@ -17,10 +17,10 @@ from pipeline.types import Task
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
-"""Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
+"""Largest number of control steps after settling, as in OpenVLA and LIBERO-Plus; longer episodes have failed."""
 
 Same = Literal["task", "scene"]
-"""What two changes may have in common: the LIBERO task, or the scene that their tasks begin in."""
+"""Common part of two changes: the LIBERO task, or the scene that their tasks begin in."""
 
 _OF_FILES = ("scene", "suite", "libero", "bddl", "benchmark", "hdf", "demo")
 _DEBRIS = re.compile(rf"[_\d/\\]|\b({'|'.join(_OF_FILES)})\b", re.IGNORECASE)
@@ -30,22 +30,25 @@ _TESTED = re.compile(
     r"(?P<base>.+?)(?:_language_\d+|_view(?:_\d+){5}_initstate_\d+|_noise_\d+|_table_\d+|_tb_\d+|_light_\d+|_add_\d+"
     r"|(?:_moved)?_level\d_sample\d)+"
 )
-"""Names of LIBERO-Plus's test tasks: that of a LIBERO task, and what is changed."""
+"""Names of LIBERO-Plus's test tasks: the name of a LIBERO task, and codes of the changes."""
 
 OWN = Path("tasks")
-"""Tasks of one's own: ``<suite>/<task>.bddl`` below this folder of the one that a run is started in, as workers are."""
+"""Folder of the user's own tasks: ``<suite>/<task>.bddl`` below it.
+
+It is relative to the folder that a run and its workers are started in.
+"""
 
 
 def suites() -> tuple[str, ...]:
-    """LIBERO's suites, then those of one's own.
+    """List LIBERO's suites, then the user's own suites.
 
     Raises:
-        PipelineError: when one of one's own has a name that cannot be used.
+        PipelineError: when an own suite has a name that cannot be used.
     """
-    own = sorted(folder.name for folder in OWN.glob("*") if any(folder.glob("*.bddl")))
-    for name in own:
-        # Datasets are called after the suite without libero_, some with val at the end, and OpenVLA-OFT takes
-        # those with aloha in it for another robot's.
+    own_suites = sorted(folder.name for folder in OWN.glob("*") if any(folder.glob("*.bddl")))
+    for name in own_suites:
+        # Datasets have the name of their suite without libero_, some with val at the end. OpenVLA-OFT assigns datasets
+        # with aloha in their name to another robot.
         if f"libero_{name}" in SUITES or not re.fullmatch(r"(?!libero_|val$|.*aloha)[a-z][a-z0-9_]*(?<!_val)", name):
             raise PipelineError(
                 f"a suite cannot be called {name!r}",
@@ -54,33 +57,36 @@ def suites() -> tuple[str, ...]:
                 "in it, and neither val nor _val at its end",
                 remedy="rename the folder, and that of its demonstrations",
             )
-    return (*SUITES, *own)
+    return (*SUITES, *own_suites)
 
 
 def tasks(suite: str) -> tuple[Task, ...]:
-    """A suite's tasks, in the order of LIBERO's list; those of one's own by name, with the instruction of their file.
+    """List a suite's tasks, in the order of LIBERO's list.
+
+    Own tasks are sorted by name, and have the instruction of their file.
 
     Raises:
-        PipelineError: when there is no such suite, or one of one's own has an instruction that cannot be used.
+        PipelineError: when no such suite exists, or an own task has a name or an instruction that cannot be used.
     """
     if suite in SUITES:
         return _listed(suite)
     if suite not in suites():
         raise PipelineError(f"unknown suite {suite!r}", expected=" or ".join(suites()))
     files = sorted((OWN / suite).absolute().glob("*.bddl"))
-    own = tuple(Task(suite, file.stem, bddl.read(file).language, file) for file in files)
-    for task in own:
+    own_tasks = tuple(Task(suite, file.stem, bddl.read(file).language, file) for file in files)
+    for task in own_tasks:
         _reject_unusable(task)
-    return own
+    return own_tasks
 
 
 def _reject_unusable(task: Task) -> None:
-    """Check the name and the instruction of a task of one's own.
+    """Check the name and the instruction of an own task.
 
     Raises:
-        PipelineError: when the name is that of a test task, or the instruction is empty or has debris.
+        PipelineError: when the name belongs to a test task, or the instruction is empty or has ``debris``.
     """
-    if base := base_of_test(task.name):
+    base = base_of_test(task.name)
+    if base:
         raise PipelineError(
             f"is called as a test task of LIBERO-Plus, which perturbs {base}",
             where=task.bddl_file,
@@ -91,9 +97,10 @@ def _reject_unusable(task: Task) -> None:
         raise PipelineError(
             "the instruction is empty", where=task.bddl_file, expected="(:language <a sentence>)", remedy="write one"
         )
-    if found := debris(task.instruction):
+    remnant = debris(task.instruction)
+    if remnant:
         raise PipelineError(
-            f"the instruction {task.instruction!r} has {found!r}",
+            f"the instruction {task.instruction!r} has {remnant!r}",
             where=task.bddl_file,
             expected=WITHOUT_DEBRIS,
             remedy="write numbers as words, and others in place of these, in (:language ...)",
@@ -101,37 +108,47 @@ def _reject_unusable(task: Task) -> None:
 
 
 def debris(instruction: str) -> str | None:
-    """What an instruction has only when it was made from a file's name; None where there is nothing."""
-    found = _DEBRIS.search(instruction)
-    return found and found[0]
+    """Return the first text in an instruction that only file names have; `None` if the instruction has no such text.
+
+    Such text shows that the instruction was derived from a file's name.
+    """
+    match = _DEBRIS.search(instruction)
+    return match[0] if match else None
 
 
 def base_of_test(name: str) -> str | None:
-    """The LIBERO task that a test task of LIBERO-Plus perturbs, by the test task's name; `None` for other names."""
+    """Return the LIBERO task that a test task of LIBERO-Plus perturbs, by its name; `None` for other names."""
     match = _TESTED.fullmatch(name)
-    known = match is not None and any(match["base"] in _names()[suite] for suite in SUITES)
-    return match["base"] if match and known else None
+    if match is None:
+        return None
+    base = match["base"]
+    is_task = any(base in _names()[suite] for suite in SUITES)
+    return base if is_task else None
 
 
 @cache
 def _listed(suite: str) -> tuple[Task, ...]:
+    """List the tasks of one of LIBERO's suites."""
     folder = libero_folder() / "bddl_files" / suite
-    # LIBERO words an instruction as the task's name without its scene.
-    worded = {name: re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ") for name in _names()[suite]}
-    return tuple(Task(suite, name, text, folder / f"{name}.bddl") for name, text in worded.items())
+    listed = []
+    for name in dict.fromkeys(_names()[suite]):
+        # LIBERO's instruction is the task's name without its scene.
+        instruction = re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ")
+        listed.append(Task(suite, name, instruction, folder / f"{name}.bddl"))
+    return tuple(listed)
 
 
 @cache
 def _names() -> Any:
-    """Suite to LIBERO's list of names; only the file that holds it is run."""
+    """Read LIBERO's lists of names: suite to names. Only the file that holds the lists is run."""
     return run_path(str(libero_folder() / "benchmark" / "libero_suite_task_map.py"))["libero_task_map"]
 
 
 def find_task(suite: str, name: str) -> Task:
-    """The task of that name.
+    """Return the task of the given name.
 
     Raises:
-        PipelineError: when the suite has none, naming the closest.
+        PipelineError: when the suite has no such task; it names the closest.
     """
     by_name = {task.name: task for task in tasks(suite)}
     if name not in by_name:
@@ -141,27 +158,29 @@ def find_task(suite: str, name: str) -> Task:
 
 
 def exceeds_step_limit(suite: str, steps: int) -> bool | None:
-    """Whether an evaluation ends before so many control steps are executed; None for suites of one's own."""
+    """Return whether an episode has more control steps than an evaluation executes; `None` for own suites."""
     return steps > STEP_LIMITS[suite] if suite in STEP_LIMITS else None
 
 
 def shared(task: Task, same: Same) -> Hashable:
-    """Equal for tasks that have the ``same`` in common."""
+    """Return a key that is equal for tasks that have the part ``same`` in common."""
     return (task.suite, task.name) if same == "task" else bddl.read(task.bddl_file).scene
 
 
 def select_tasks(patterns: Iterable[str]) -> list[Task]:
-    """The tasks whose ``<suite>/<task>`` matches any of the shell-style patterns, in LIBERO's order.
+    """Return the tasks whose ``<suite>/<task>`` matches any of the shell-style patterns, in LIBERO's order.
 
     Raises:
-        PipelineError: when a pattern matches nothing.
+        PipelineError: when a pattern matches no task.
     """
-    known = {str(task): task for suite in suites() for task in tasks(suite)}
+    by_name: dict[str, Task] = {}
+    for suite in suites():
+        by_name |= {str(task): task for task in tasks(suite)}
     chosen: set[str] = set()
     for pattern in patterns:
-        matched = fnmatch.filter(known, pattern)
+        matched = fnmatch.filter(by_name, pattern)
         if not matched:
-            closest = difflib.get_close_matches(pattern, known, cutoff=0)
+            closest = difflib.get_close_matches(pattern, by_name, cutoff=0)
             raise PipelineError(f"no task matches {pattern!r}", expected="a pattern such as " + " or ".join(closest))
         chosen.update(matched)
-    return [task for name, task in known.items() if name in chosen]
+    return [task for name, task in by_name.items() if name in chosen]

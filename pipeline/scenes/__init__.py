@@ -1,4 +1,4 @@
-"""Compiled scenes: what is where, and what would collide. Nothing of it needs OpenGL."""
+"""Compiled scenes: places of things, and collisions. The package needs no OpenGL."""
 
 from pipeline import gl
 

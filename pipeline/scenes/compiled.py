@@ -1,4 +1,4 @@
-"""A scene compiled for its physics and put into its state, for perturbations that depend on where things stand."""
+"""Compiled scenes in their states, for perturbations that depend on the places of things."""
 
 import xml.etree.ElementTree as ET
 from functools import lru_cache
@@ -14,31 +14,32 @@ Joints = NDArray[np.intp]
 
 ARM = tuple(f"robot0_joint{number}" for number in range(1, 8))
 FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
-"""The robot's joints, base to wrist, and those of its gripper."""
+"""Joints of the robot's arm, base to wrist, and joints of its gripper."""
 
 
 def compiled(model_xml: str) -> mujoco.MjModel:
-    """A scene's model, images included.
+    """Compile a scene's model, images included.
 
-    Compiled in 0.6 s, and in 2 to 3 by a process that has not read its files before.
+    This takes 0.6 s, and 2 to 3 s in a process that has not read the scene's files before.
 
     Raises:
-        ValueError: when MuJoCo refuses the scene.
+        ValueError: when MuJoCo rejects the scene.
     """
     model = mujoco.MjModel.from_xml_string(model_xml)
-    # MuJoCo keeps what it read last, images included, until it reads something else: 300 MB.
+    # MuJoCo keeps the last document that it read, images included, until it reads another document: 300 MB.
     mujoco.MjModel.from_xml_string("<mujoco/>")
     return model
 
 
 @lru_cache(maxsize=2)
 def physics_to_read(model_xml: str) -> mujoco.MjModel:
-    """A scene's model, with plain colours for images: nothing is rendered with it, and images are half of the work.
+    """Compile a scene's model for physics, with plain colours instead of images.
 
-    The same for all who ask, and not to be written into: compiling takes 0.2 to 0.4 s, a copy 0.05 s and 100 MB.
+    The model is not used for rendering, and images are half of the work. All callers share one model and must not
+    change it: compiling takes 0.2 to 0.4 s, a copy 0.05 s and 100 MB.
 
     Raises:
-        ValueError: when MuJoCo refuses the scene.
+        ValueError: when MuJoCo rejects the scene.
     """
     scene = ET.fromstring(model_xml)
     for texture in scene.iterfind("asset/texture[@name][@file]"):
@@ -48,7 +49,7 @@ def physics_to_read(model_xml: str) -> mujoco.MjModel:
 
 
 class CompiledScene:
-    """A scene's model, as of ``physics_to_read``, not to be written into, and data at its state."""
+    """A scene's model of ``physics_to_read``, which must not be changed, and data in the scene's state."""
 
     def __init__(self, scene: Scene):
         self.model = physics_to_read(scene.model_xml)
@@ -57,54 +58,57 @@ class CompiledScene:
 
     @property
     def state(self) -> Floats:
-        """(S,) flattened MuJoCo state: time, qpos, qvel."""
+        """Flattened MuJoCo state (S,): time, qpos, qvel."""
         return State(self.data.time, self.data.qpos, self.data.qvel).flat
 
     def restore(self, state: Floats) -> None:
-        """Reset the data, put a flattened state (S,) into it and compute its contacts."""
+        """Reset the data, set a flattened state (S,) and compute the contacts."""
         mujoco.mj_resetData(self.model, self.data)
         State.of(state, self.model.nq).put_into(self.data)
         mujoco.mj_forward(self.model, self.data)
 
     def xy_m(self, name: str) -> Floats:
-        """(2,) where a movable object stands, by its name in the BDDL file."""
+        """Return the position (2,) of a movable object, by its name in the BDDL file."""
         return np.asarray(self.data.body(f"{name}_main").xpos[:2])
 
     def pose_in(self, state: Floats, name: str) -> Floats:
-        """(7,) the part of a flattened state (S,) that is a movable object's pose: position in m, rotation wxyz."""
+        """Return the part (7,) of a flattened state (S,) that holds a movable object's pose.
+
+        The pose is the position in m, then the rotation wxyz. The result is a view of the state.
+        """
         first = int(self.model.joint(f"{name}_joint0").qposadr[0])
         return State.of(state, self.model.nq).qpos[first : first + 7]
 
     @property
     def contacts(self) -> NDArray[np.intp]:
-        """(C, 2) the bodies in contact."""
+        """Pairs (C, 2) of bodies in contact."""
         contact = self.data.contact
         return np.asarray(self.model.geom_bodyid[contact.geom[contact.dist <= 0]], np.intp)
 
     def touching(self) -> dict[tuple[int, int], float]:
-        """Each pair of bodies of different things in contact, and the gap in m: deepest, negative."""
+        """Map each pair of bodies of different things in contact to their deepest gap in m, which is negative or 0."""
         contact = self.data.contact
         bodies = np.sort(self.model.geom_bodyid[contact.geom], axis=1)
-        one, other = self.model.body_rootid[bodies].T
-        met = (one != other) & (contact.dist <= 0)
+        first_roots, second_roots = self.model.body_rootid[bodies].T
+        touching = (first_roots != second_roots) & (contact.dist <= 0)
         gaps: dict[tuple[int, int], float] = {}
-        for (first, second), gap_m in zip(bodies[met].tolist(), contact.dist[met].tolist(), strict=True):
+        for (first, second), gap_m in zip(bodies[touching].tolist(), contact.dist[touching].tolist(), strict=True):
             gaps[first, second] = min(gaps.get((first, second), 0.0), gap_m)
         return gaps
 
 
 def simulate_held(model: mujoco.MjModel, data: mujoco.MjData, held: Joints, seconds: float) -> None:
-    """Let a scene move for some time while the ``held`` of its joints stay where they are."""
-    positions_of = np.repeat(np.arange(model.njnt), np.diff([*model.jnt_qposadr, model.nq]))
-    qpos, qvel = np.isin(positions_of, held), np.isin(model.dof_jntid, held)
-    start = data.qpos[qpos].copy()
+    """Simulate a scene for some seconds while the joints ``held`` keep their positions."""
+    joint_of_qpos = np.repeat(np.arange(model.njnt), np.diff([*model.jnt_qposadr, model.nq]))
+    held_qpos, held_qvel = np.isin(joint_of_qpos, held), np.isin(model.dof_jntid, held)
+    start = data.qpos[held_qpos].copy()
     for _ in range(round(seconds / model.opt.timestep)):
         mujoco.mj_step(model, data)
-        data.qpos[qpos], data.qvel[qvel] = start, 0.0
+        data.qpos[held_qpos], data.qvel[held_qvel] = start, 0.0
 
 
 def fixed_pose(data: mujoco.MjData, name: str) -> Floats:
-    """(7,) position in m and rotation wxyz of a fixture or a region, by its name in the BDDL file."""
+    """Return position in m and rotation wxyz (7,) of a fixture or a region, by its name in the BDDL file."""
     if mujoco.mj_name2id(data.model, mujoco.mjtObj.mjOBJ_BODY, f"{name}_main") >= 0:
         body = data.body(f"{name}_main")
         return np.concatenate([body.xpos, body.xquat])
@@ -114,9 +118,10 @@ def fixed_pose(data: mujoco.MjData, name: str) -> Floats:
 
 
 def proprioception(data: mujoco.MjData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """State (8,) and joint state (7,) of a restored scene; names and units in ``schemas/episode.json``."""
+    """Return state (8,) and joint state (7,) of a restored scene; names and units are in ``schemas/episode.json``."""
     position = data.site("gripper0_grip_site").xpos
     w, *xyz = data.body("robot0_right_hand").xquat
-    fingers, joints = ([data.joint(name).qpos[0] for name in names] for names in (FINGERS, ARM))
+    fingers = [data.joint(name).qpos[0] for name in FINGERS]
+    joints = [data.joint(name).qpos[0] for name in ARM]
     state = np.concatenate([position, axis_angle(w, np.array(xyz)), fingers])
     return state.astype(np.float32), np.array(joints, np.float32)

@@ -1,4 +1,4 @@
-"""A demonstration's scene with one or all of its things moved, and whether that scene can be."""
+"""Displacement of one or several things in a demonstration's scene, and checks that the moved scene is possible."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
@@ -18,26 +18,26 @@ from pipeline.scenes.compiled import CompiledScene, simulate_held
 from pipeline.types import Floats, Scene, Task
 
 SETTLE_S = 0.3
-"""How long a scene is watched. The farthest that an object of the starter demonstrations still falls takes 0.06 s."""
+"""Time for which a scene is simulated to check it. The longest fall in the starter demonstrations takes 0.06 s."""
 
 DEEPER_M = 0.001
-"""How much deeper than recorded two things may sit in each other, such as a bowl in the wall of its drawer."""
+"""Largest increase over the recording of the depth by which two things overlap, such as a bowl and its drawer."""
 
 CREEP_M, CREEP_DEG = 0.002, 2.0
-"""How much farther than recorded an object may slide and tilt until it stops."""
+"""Largest increase over the recording of the distance and the angle that an object slides and tilts until it stops."""
 
 Moves = Mapping[str, tuple[float, float]]
 """Object or fixture, by its name in the BDDL file, to its displacement (dx, dy) in m."""
 
 
 def move_one(scene: Scene, task: Task, name: str, shift_m: tuple[float, float], turn_deg: float) -> Scene:
-    """The scene with an object moved in the horizontal plane and turned about the vertical through its origin.
+    """Move an object of a scene in the horizontal plane, and turn it about the vertical through its origin.
 
-    The recorded and the moved object are both watched for ``SETTLE_S`` while everything else is held: they must come to
-    rest on the same things, after as little motion.
+    The recorded and the moved object are both simulated for ``SETTLE_S`` while everything else is held. Both must come
+    to rest on the same things, and the moved object must not move more than the recorded object.
 
     Raises:
-        RefusedError: as ``move``.
+        RefusedError: for the reasons of ``move``.
     """
     before = CompiledScene(scene)
     moved = replace(scene, state=scene.state.copy())
@@ -46,27 +46,28 @@ def move_one(scene: Scene, task: Task, name: str, shift_m: tuple[float, float], 
     pose[3:] = rotations.product(rotations.about("z", turn_deg), pose[3:])
     after = CompiledScene(moved)
     _refuse_relations(task, after)
-    _refuse(before, after, before.model.jnt_bodyid == before.model.body(f"{name}_main").id, {name: shift_m})
-    found = {"moved": name, "position_m": pose[:3].tolist(), "rotation_wxyz": pose[3:].tolist()}
-    return replace(moved, resolved={**scene.resolved, "pose": found})
+    joints_of_object = before.model.jnt_bodyid == before.model.body(f"{name}_main").id
+    _refuse(before, after, joints_of_object, {name: shift_m})
+    resolved = {"moved": name, "position_m": pose[:3].tolist(), "rotation_wxyz": pose[3:].tolist()}
+    return replace(moved, resolved={**scene.resolved, "pose": resolved})
 
 
 def move(scene: Scene, task: Task, moves: Moves) -> Scene:
-    """The scene with things moved in the horizontal plane: fixtures and goal regions in its MJCF, objects in its state.
+    """Move things of a scene in the horizontal plane: fixtures and goal regions in its MJCF, objects in its state.
 
-    A region of the working surface that the goal names moves with the thing that it is named after, so that the front
-    of the stove stays in front of the stove. The recorded and the moved scene are both watched for ``SETTLE_S`` while
-    the robot and the fixtures' joints are held.
+    A region of the working surface that the goal names moves with the thing that it is named after: the front of the
+    stove stays in front of the stove. The recorded and the moved scene are both simulated for ``SETTLE_S`` while the
+    robot and the fixtures' joints are held.
 
     Raises:
-        RefusedError: ``relation_broken`` when something leaves what it stands on or in, or a target the place that the
-            instruction names; ``object_in_collision`` when things touch that did not; ``object_unstable`` when an
-            object slides or tilts more than the recorded one.
+        RefusedError: ``relation_broken`` when a thing loses contact with the thing that it stands on or in, or a target
+            leaves the place that the instruction names; ``object_in_collision`` when things touch that did not touch
+            before; ``object_unstable`` when an object slides or tilts more than the recorded object.
     """
-    known = bddl.read(task.bddl_file)
+    definition = bddl.read(task.bddl_file)
     before = CompiledScene(scene)
-    regions = {region: moves[thing] for region, thing in known.goal_regions.items() if thing in moves}
-    fixtures = {name: shift for name, shift in moves.items() if name in known.fixtures}
+    regions = {region: moves[thing] for region, thing in definition.goal_regions.items() if thing in moves}
+    fixtures = {name: shift for name, shift in moves.items() if name in definition.fixtures}
     model_xml = _shifted(scene.model_xml, fixtures, regions)
     state = scene.state.copy()
     for name in moves.keys() - fixtures.keys():
@@ -74,20 +75,20 @@ def move(scene: Scene, task: Task, moves: Moves) -> Scene:
     moved = replace(scene, model_xml=model_xml, state=state)
     after = CompiledScene(moved)
     _refuse_relations(task, after)
-    placed = {name: after.data.body(f"{name}_main").xpos.tolist() for name in moves}
+    positions_m = {name: after.data.body(f"{name}_main").xpos.tolist() for name in moves}
     if _blocked(after, fixtures) - _blocked(before, fixtures):
         raise RefusedError("object_in_collision")
     _refuse(before, after, before.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE, moves)
-    return replace(moved, resolved={**scene.resolved, "pose": {"positions_m": placed}})
+    return replace(moved, resolved={**scene.resolved, "pose": {"positions_m": positions_m}})
 
 
 def _shifted(model_xml: str, fixtures: Moves, regions: Moves) -> str:
-    """The scene's MJCF with the bodies of fixtures and the sites of regions moved."""
+    """Move the bodies of fixtures and the sites of regions in a scene's MJCF."""
     tree = ET.fromstring(model_xml)
-    for element, shift in [
-        *((tree.find(f"worldbody//body[@name='{name}_main']"), shift) for name, shift in fixtures.items()),
-        *((tree.find(f"worldbody//site[@name='{name}']"), shift) for name, shift in regions.items()),
-    ]:
+    shifts = {f"body[@name='{name}_main']": shift for name, shift in fixtures.items()}
+    shifts |= {f"site[@name='{name}']": shift for name, shift in regions.items()}
+    for path, shift in shifts.items():
+        element = tree.find(f"worldbody//{path}")
         if element is None:
             raise RefusedError("scene_refused")
         x, y, z = map(float, element.get("pos", "0 0 0").split())
@@ -96,16 +97,17 @@ def _shifted(model_xml: str, fixtures: Moves, regions: Moves) -> str:
 
 
 def _refuse_relations(task: Task, scene: CompiledScene) -> None:
+    """Reject a scene with a target outside of the place that the instruction names."""
     if not all(relation_holds(task, target, scene.xy_m) for target in bddl.read(task.bddl_file).targets):
         raise RefusedError("relation_broken")
 
 
 class _Settled(NamedTuple):
-    """How a scene came to rest: gaps in m of what touched at the start and at rest, and how far objects went.
+    """Contacts of a scene at the start and at rest, and the motion of its objects.
 
     Attributes:
-        started, rested: pairs of bodies to the gap between them, deepest, negative.
-        slid_m, tilted_deg: (N,) of each object that was free to move.
+        started, rested: pairs of touching bodies, at the start and at rest, to their deepest gap in m, negative or 0.
+        slid_m, tilted_deg: (N,) distance and angle of each object that was free to move.
     """
 
     started: Mapping[tuple[int, int], float]
@@ -115,7 +117,7 @@ class _Settled(NamedTuple):
 
 
 def _settle(compiled: CompiledScene, free: NDArray[np.bool_]) -> _Settled:
-    """Let objects come to rest from the compiled state while all but their joints (njnt,) are held."""
+    """Let objects come to rest from the compiled state; all joints are held except the joints ``free`` (njnt,)."""
     model, data = compiled.model, compiled.data
     poses = model.jnt_qposadr[free, None] + np.arange(7)
     started, first = compiled.touching(), data.qpos[poses]
@@ -128,37 +130,51 @@ def _settle(compiled: CompiledScene, free: NDArray[np.bool_]) -> _Settled:
 
 
 def _blocked(compiled: CompiledScene, fixtures: Iterable[str]) -> set[tuple[str, str]]:
-    """Pairs of fixtures, or a fixture and the robot's mount, that overlap: MuJoCo has no contacts between what cannot
-    move."""
+    """Return pairs of fixtures, and of a fixture and the robot's mount, that overlap.
+
+    MuJoCo computes no contacts between immovable bodies.
+    """
     model, data = compiled.model, compiled.data
     solid = (model.geom_contype | model.geom_conaffinity) != 0
     roots = model.body_rootid[model.geom_bodyid]
     names = ["robot0_base", *(f"{name}_main" for name in fixtures)]
     geoms = {name: np.flatnonzero(solid & (roots == model.body(name).id)) for name in names}
     overlapping = set()
-    for one, other in combinations(names, 2):
-        for first, second in product(geoms[one], geoms[other]):
-            apart_m = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second])
-            if apart_m < model.geom_rbound[first] + model.geom_rbound[second] and (
-                mujoco.mj_geomDistance(model, data, first, second, 0.001, None) <= 0
-            ):
-                overlapping.add((one, other))
+    for first_name, second_name in combinations(names, 2):
+        for first, second in product(geoms[first_name], geoms[second_name]):
+            centres_apart_m = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second])
+            spheres_overlap = centres_apart_m < model.geom_rbound[first] + model.geom_rbound[second]
+            if spheres_overlap and mujoco.mj_geomDistance(model, data, first, second, 0.001, None) <= 0:
+                overlapping.add((first_name, second_name))
                 break
     return overlapping
 
 
 def _refuse(before: CompiledScene, after: CompiledScene, free: NDArray[np.bool_], moves: Moves) -> None:
-    """Raise what is wrong with the moved scene, where the ``free`` of its joints (njnt,) are let move."""
-    then, now = _settle(before, free), _settle(after, free)
-    new = (now.started.keys() | now.rested.keys()) - (then.started.keys() | then.rested.keys())
-    deeper = any(gap_m < then.started.get(pair, 0.0) - DEEPER_M for pair, gap_m in now.started.items())
+    """Settle the recorded and the moved scene, and reject the moved scene if it differs too much.
+
+    Args:
+        before: the recorded scene.
+        after: the moved scene.
+        free: (njnt,) mask of the joints that can move; all other joints are held.
+        moves: displacements of the moved things.
+
+    Raises:
+        RefusedError: for the reasons of ``move``.
+    """
+    recorded, moved = _settle(before, free), _settle(after, free)
+    new = (moved.started.keys() | moved.rested.keys()) - (recorded.started.keys() | recorded.rested.keys())
+    deeper = any(gap_m < recorded.started.get(pair, 0.0) - DEEPER_M for pair, gap_m in moved.started.items())
     if new or deeper:
         raise RefusedError("object_in_collision")
-    # Neighbours that move apart may lose touch; nothing may lose touch with what it moves with or stands on.
+    # Neighbours that move apart may lose contact. A thing must not lose contact with the thing that it moves with or
+    # stands on.
     shifts = {int(after.model.body(f"{name}_main").id): shift for name, shift in moves.items()}
-    for pair in then.rested.keys() - now.rested.keys():
-        one, other = (shifts.get(int(after.model.body_rootid[body])) for body in pair)
-        if one == other or one is None or other is None:
+    for pair in recorded.rested.keys() - moved.rested.keys():
+        first_shift, second_shift = (shifts.get(int(after.model.body_rootid[body])) for body in pair)
+        if first_shift == second_shift or first_shift is None or second_shift is None:
             raise RefusedError("relation_broken")
-    if (now.slid_m > then.slid_m + CREEP_M).any() or (now.tilted_deg > then.tilted_deg + CREEP_DEG).any():
+    slid_farther = (moved.slid_m > recorded.slid_m + CREEP_M).any()
+    tilted_farther = (moved.tilted_deg > recorded.tilted_deg + CREEP_DEG).any()
+    if slid_farther or tilted_farther:
         raise RefusedError("object_unstable")

@@ -1,4 +1,4 @@
-"""The space that a demonstration moves through, and the surfaces that added objects may stand on."""
+"""Space that a demonstration moves through, and surfaces that added objects may stand on."""
 
 import copy
 
@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from pipeline.types import Floats
 
 SURFACES = ("table", "study_table", "living_room_table", "floor")
-"""Bodies of LIBERO's arenas that objects stand on; the first that an arena has is its working surface."""
+"""Bodies of LIBERO's arenas that objects stand on; the first body that an arena has is its working surface."""
 _RAY_GROUP = 5
 
 
 class SweptPath:
-    """A copy of a model whose only contacts are those not allowed: of an added object with anything but a surface.
+    """A copy of a model that detects only forbidden contacts: an added object with anything but a surface.
 
     Args:
-        model: the scene with the objects; their joints are its last.
-        added: (ngeom,) which geoms are the objects'.
+        model: the scene with the objects; the objects' joints are the last.
+        added: (ngeom,) mask of the objects' geoms.
         path: (K+1, nq) positions of all other joints along the demonstration.
     """
 
@@ -33,16 +33,18 @@ class SweptPath:
         model.geom_contype[:] = np.where(added, 2, 1) * (touches & ~stands_on)
         model.geom_conaffinity[:] = np.where(added, 3, 0) * touches
         for body in range(model.nbody):
-            own = model.geom_bodyid == body
-            model.body_contype[body] = np.bitwise_or.reduce(model.geom_contype[own], initial=0)
-            model.body_conaffinity[body] = np.bitwise_or.reduce(model.geom_conaffinity[own], initial=0)
+            geoms = model.geom_bodyid == body
+            model.body_contype[body] = np.bitwise_or.reduce(model.geom_contype[geoms], initial=0)
+            model.body_conaffinity[body] = np.bitwise_or.reduce(model.geom_conaffinity[geoms], initial=0)
         model.geom_group[:] = np.where(touches & (roots == surfaces[0]), _RAY_GROUP, 0)
         self._data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self._data)
 
     def clear(self, poses: Floats, clearance_m: float) -> bool:
-        """Whether nothing comes closer than that to objects at poses (N, 7), nor they to one another, all along the
-        demonstration."""
+        """Return whether objects at poses (N, 7) keep a clearance during the whole demonstration.
+
+        Each object must be at least ``clearance_m`` away from the other objects and from everything else but a surface.
+        """
         model, data = self._model, self._data
         model.geom_margin[self._added] = clearance_m
         model.body_margin[model.geom_bodyid[self._added]] = clearance_m
@@ -56,8 +58,9 @@ class SweptPath:
         return True
 
     def height(self, at_m: Floats) -> float:
-        """Height (m) of the working surface at (x, y); minus infinity beside it."""
+        """Return the height in m of the working surface at (x, y); minus infinity outside of the surface."""
         above, down = np.array([*at_m, 3.0]), np.array([0.0, 0.0, -1.0])
-        only, hit = np.arange(6) == _RAY_GROUP, np.array([-1], np.int32)
-        distance = mujoco.mj_ray(self._model, self._data, above, down, only.astype(np.uint8), 1, -1, hit)
+        groups = (np.arange(6) == _RAY_GROUP).astype(np.uint8)
+        hit = np.array([-1], np.int32)
+        distance = mujoco.mj_ray(self._model, self._data, above, down, groups, 1, -1, hit)
         return float(above[2] - distance) if hit[0] >= 0 else -np.inf

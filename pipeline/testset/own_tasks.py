@@ -1,4 +1,4 @@
-"""Tasks of one's own compared with the benchmark's test tasks: a copy of a test task must not be trained on."""
+"""Comparison of the user's own tasks with the benchmark's test tasks: a copy of a test task must not be trained on."""
 
 import re
 import zipfile
@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
+from pipeline.libero.bddl import Bddl
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.testset.benchmark import FOLDER, TestTask, fetch_testset, load
 from pipeline.testset.definitions import Reader
@@ -16,12 +17,12 @@ from pipeline.types import Task
 
 
 class _TestDefinitions(NamedTuple):
-    """What only LIBERO-Plus's BDDL files have and LIBERO's have not, each to the test task that it is first found in.
+    """Content of LIBERO-Plus's BDDL files that LIBERO's files lack, each to the first test task that has it.
 
     Attributes:
-        scenes: by ``Bddl.scene``, of test tasks that add or move things.
+        scenes: ``Bddl.scene`` of test tasks that add or move things.
         classes: names of the classes of scenes with other light, surfaces and walls.
-        instructions: rewritten, as ``_plain``.
+        instructions: rewritten instructions, normalised by ``_plain``.
     """
 
     scenes: Mapping[Hashable, str]
@@ -30,19 +31,21 @@ class _TestDefinitions(NamedTuple):
 
 
 def reject_test_tasks(wanted: Iterable[Task], folder: Path = FOLDER) -> None:
-    """Compare scene, scene class and instruction of each task of one's own with those of the test tasks.
+    """Compare scene, scene class and instruction of each own task with the test tasks.
 
-    An own task in one of LIBERO's scenes is no test task: the tests of camera, robot start, noise and language begin
-    there, as LIBERO's own demonstrations do. Nothing is fetched if no task is one's own.
+    An own task in one of LIBERO's scenes is no test task: the tests of camera, robot start, noise and language begin in
+    these scenes, and so do LIBERO's own demonstrations. Nothing is fetched if all tasks are LIBERO's.
 
     Raises:
-        PipelineError: naming the first BDDL file that equals a test task.
+        PipelineError: when a task equals a test task; it names the first such BDDL file.
     """
-    for task in wanted:
-        if task.suite not in SUITES and (equal := _equal_test(task, folder)):
-            what, test_task = equal
+    own_tasks = [task for task in wanted if task.suite not in SUITES]
+    for task in own_tasks:
+        equal = _equal_test(task, folder)
+        if equal is not None:
+            part, test_task = equal
             raise PipelineError(
-                f"has the {what} of LIBERO-Plus's test task {test_task}",
+                f"has the {part} of LIBERO-Plus's test task {test_task}",
                 where=task.bddl_file,
                 expected="a task that the benchmark does not test",
                 remedy="change it, or leave it out of demos.tasks: a policy that is trained on it cannot be tested",
@@ -50,20 +53,24 @@ def reject_test_tasks(wanted: Iterable[Task], folder: Path = FOLDER) -> None:
 
 
 def _equal_test(task: Task, folder: Path) -> tuple[str, str] | None:
-    """What a task has in common with a test task, and the name of that; `None` if there is none."""
-    test, own = _definitions(folder), bddl.read(task.bddl_file)
-    if own.problem in test.classes:
-        return "scene class", test.classes[own.problem]
-    if own.scene in test.scenes:
-        return "scene", test.scenes[own.scene]
-    if (plain := _plain(own.language)) in test.instructions:
-        return "instruction", test.instructions[plain]
+    """Return the part that a task shares with a test task, and the test task's name; `None` if it shares no part."""
+    test, definition = _definitions(folder), bddl.read(task.bddl_file)
+    if definition.problem in test.classes:
+        return "scene class", test.classes[definition.problem]
+    if definition.scene in test.scenes:
+        return "scene", test.scenes[definition.scene]
+    instruction = _plain(definition.language)
+    if instruction in test.instructions:
+        return "instruction", test.instructions[instruction]
     return None
 
 
 @cache
 def _definitions(folder: Path) -> _TestDefinitions:
-    liberos = [bddl.read(task.bddl_file) for suite in SUITES for task in tasks(suite)]
+    """Collect the definitions that only test tasks have, from the wheel in ``folder``."""
+    libero_definitions: list[Bddl] = []
+    for suite in SUITES:
+        libero_definitions += [bddl.read(task.bddl_file) for task in tasks(suite)]
     scenes: dict[Hashable, str] = {}
     classes: dict[str, str] = {}
     instructions: dict[str, str] = {}
@@ -77,17 +84,18 @@ def _definitions(folder: Path) -> _TestDefinitions:
                 classes.setdefault(bddl.heading(_text(reader, test_task), name)[0], name)
             elif test_task.axis == "language":
                 instructions.setdefault(_plain(str(test_task.parameters["text"])), name)
-    for known in liberos:
-        scenes.pop(known.scene, None)
-        classes.pop(known.problem, None)
-        instructions.pop(_plain(known.language), None)
+    for definition in libero_definitions:
+        scenes.pop(definition.scene, None)
+        classes.pop(definition.problem, None)
+        instructions.pop(_plain(definition.language), None)
     return _TestDefinitions(scenes, classes, instructions)
 
 
 def _text(reader: Reader, test_task: TestTask) -> str:
+    """Return the text of a test task's BDDL file."""
     return reader.packed(f"bddl_files/{test_task.suite}/{test_task.name}.bddl").decode()
 
 
 def _plain(instruction: str) -> str:
-    """The words of an instruction, without case and punctuation."""
+    """Return the words of an instruction, without case and punctuation."""
     return " ".join(re.findall(r"[a-z0-9]+", instruction.lower()))
