@@ -24,7 +24,7 @@ def control_env() -> Any:
     """Return LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner.
 
     Raises:
-        PipelineError: as ``gl.check_device`` and ``jit.keeping_compiled``.
+        PipelineError: see ``gl.check_device`` and ``jit.keeping_compiled``.
     """
     logging.disable(logging.WARNING)
     try:

@@ -159,7 +159,7 @@ class Environment:
         """Keep the arm still, with the gripper open, for some control steps, while arm and objects come to rest.
 
         Raises:
-            RefusedError: as ``step``.
+            RefusedError: see ``step``.
         """
         # A push counts its steps from the first observation, which follows the settling.
         self._steps = -steps

@@ -49,7 +49,7 @@ def calls() -> Any:
     A function raises ``PipelineError`` if OpenGL reports an error of its call.
 
     Raises:
-        PipelineError: as ``check``, for an earlier call that is not the pipeline's.
+        PipelineError: see ``check``, for an earlier call that is not the pipeline's.
     """
     check(OTHERS)
     return _FUNCTIONS
