@@ -25,27 +25,34 @@ def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
 
 
 def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
-    """A frame at another size, each pixel the mean of the area that it covers; itself where that is its size."""
+    """Resize a frame, so that each pixel is the mean of the area that it covers.
+
+    If the frame has the requested size already, return the frame itself.
+    """
     if frame.shape[:2] == (height_px, width_px):
         return frame
     return np.asarray(cv2.resize(frame, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def encode(frame: Frame, config: RenderConfig) -> bytes:
-    """JPEG file of an RGB frame; every dataset carries these bytes or pixels decoded from them."""
+    """Encode an RGB frame as a JPEG file; every dataset carries these bytes or pixels decoded from them."""
     bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
     _, packed = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
     return packed.tobytes()
 
 
 def encode_exactly(pixels: NDArray[Any]) -> bytes:
-    """PNG file of (H, W) uint8 or uint16."""
+    """Encode pixels (H, W) of uint8 or uint16 as a PNG file."""
     _, packed = cv2.imencode(".png", pixels)
     return packed.tobytes()
 
 
 def decode(packed: bytes) -> Frame:
-    """(H, W, 3) uint8 RGB of an encoded frame."""
+    """Decode an encoded frame to (H, W, 3) uint8 RGB.
+
+    Raises:
+        ValueError: if OpenCV cannot decode the bytes.
+    """
     frame = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_COLOR_RGB)
     if frame is None:
         raise ValueError("not an image that OpenCV can decode")

@@ -1,4 +1,4 @@
-"""LIBERO's environment around a scene, and replaying demonstrations in it. Nothing of it needs OpenGL."""
+"""LIBERO's environment around a scene, and the replay of demonstrations in it. No module here needs OpenGL."""
 
 from pipeline import gl
 

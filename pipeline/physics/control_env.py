@@ -1,4 +1,4 @@
-"""LIBERO's environment class imported without OpenGL, and its resets, which draw from NumPy's global generator."""
+"""LIBERO's environment class, imported without OpenGL, and its resets, which sample from NumPy's global generator."""
 
 import logging
 import sys
@@ -17,14 +17,14 @@ from pipeline.libero.assets import package_folder
 from pipeline.types import Task
 
 PLACEMENT_TRIES = 50
-"""Resets, of which each draws 5,000 places for an object that finds none."""
+"""Largest number of resets. Each reset samples up to 5,000 places for an object."""
 
 
 def control_env() -> Any:
-    """LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner.
+    """Return LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner.
 
     Raises:
-        PipelineError: as ``gl.check_device`` and ``jit.keeping_compiled``.
+        PipelineError: see ``gl.check_device`` and ``jit.keeping_compiled``.
     """
     logging.disable(logging.WARNING)
     try:
@@ -38,24 +38,27 @@ def control_env() -> Any:
 
 
 def _set_macros() -> None:
-    """Unset robosuite's ``MUJOCO_GPU_RENDERING``, by which it loads EGL when it is imported, even where disabled, and
-    its log ``/tmp/robosuite.log``, which it cannot open where it is another user's.
+    """Unset robosuite's ``MUJOCO_GPU_RENDERING`` and its log ``/tmp/robosuite.log``.
 
-    The flags lie in a module of the package, and importing that module would import the package first.
+    ``MUJOCO_GPU_RENDERING`` makes robosuite load EGL on import, even if EGL is disabled. robosuite cannot open a log
+    that belongs to another user. The flags are stored in a module of the package. Importing that module would import
+    the package first.
     """
-    macros, flags = ModuleType("robosuite.macros"), run_path(str(package_folder("robosuite") / "macros.py"))
+    macros = ModuleType("robosuite.macros")
+    flags = run_path(str(package_folder("robosuite") / "macros.py"))
     flags |= {"__name__": macros.__name__, "MUJOCO_GPU_RENDERING": False, "FILE_LOGGING_LEVEL": None}
     vars(macros).update(flags)
     sys.modules[macros.__name__] = macros
 
 
 def until_placed(reset: Callable[[], Any], task: Task) -> Any:
-    """Call LIBERO's reset, or its constructor, which resets too, until the random draws give every object a place.
+    """Call LIBERO's reset until the random samples give every object a place.
 
-    LIBERO's own wrapper repeats a reset without end, whatever went wrong, and its constructor never.
+    ``reset`` may also be LIBERO's constructor, which resets too. LIBERO's own wrapper repeats a failed reset without
+    end, for any error. Its constructor never repeats one.
 
     Raises:
-        PipelineError: after ``PLACEMENT_TRIES``.
+        PipelineError: after ``PLACEMENT_TRIES`` resets.
     """
     from robosuite.utils.errors import RandomizationError
 
@@ -71,7 +74,7 @@ def until_placed(reset: Callable[[], Any], task: Task) -> Any:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """LIBERO's samplers draw from numpy's global generator: seed it for a moment, then put it back."""
+    """Seed NumPy's global generator, from which LIBERO's samplers sample, and restore its state at the end."""
     saved = np.random.get_state()
     np.random.seed(seed)
     try:

@@ -22,11 +22,15 @@ from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Push, Scene, Task
 
 DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-"""(7,) what is done while a scene settles: nothing, with the gripper open (OpenVLA's and LIBERO-Plus's rule)."""
+"""(7,) action while a scene settles: no motion, with the gripper open (OpenVLA's and LIBERO-Plus's rule)."""
 
 
 class UnusableSceneError(PipelineError):
-    """A scene or a state that cannot be simulated: ``scene_refused`` or ``state_mismatch``, as the manifest says it."""
+    """Error for a scene or state that cannot be simulated.
+
+    Attributes:
+        reason: ``scene_refused`` or ``state_mismatch``, as the manifest states it.
+    """
 
     def __init__(self, reason: str, what: str, task: Task):
         super().__init__(
@@ -39,12 +43,13 @@ class UnusableSceneError(PipelineError):
 
 
 class Environment:
-    """One task's environment; every ``restore`` forgets what happened before it.
+    """One task's environment; every ``restore`` discards all earlier effects.
 
-    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task.
+    Building an environment takes 1 to 3 s, so keep it for all demonstrations of its task.
 
     Args:
-        scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
+        task: the task, whose BDDL file describes the scene.
+        scene_properties: ``floor_style`` and ``wall_style``, if they differ from those of the task's arena.
         scene_xml: absolute path of another file for the arena.
     """
 
@@ -63,10 +68,11 @@ class Environment:
         self._steps = 0
 
     def place_fixtures(self, seed: int) -> str:
-        """The scene as LIBERO's own first reset makes it under ``seed``, as MJCF; 1.3 s, the second time nothing.
+        """Return the scene of LIBERO's own first reset under ``seed`` as MJCF.
 
-        For demonstrations whose source did not record the scene: movable objects are put where the recorded state
-        says, but fixtures (cabinet, stove, rack, microwave) are not part of it and stay where the reset put them.
+        Use it for demonstrations whose source did not record the scene. The recorded state places movable objects. It
+        has no fixtures (cabinet, stove, rack, microwave), so fixtures stay where the reset placed them. The first call
+        for a seed takes 1.3 s; later calls return the stored MJCF.
         """
         if seed not in self._placed:
             self._reset_under(seed)
@@ -74,43 +80,43 @@ class Environment:
         return self._placed[seed]
 
     def reset(self, seed: int) -> str:
-        """The scene of LIBERO's own first reset under ``seed``, as MJCF, as of its initial states; 1.3 s.
+        """Reset the environment under ``seed`` as for LIBERO's initial states, and return the scene as MJCF; 1.3 s.
 
-        Fixtures and objects stand where ``place_fixtures`` and the BDDL file have them, and the arm at home with
-        robosuite's default noise, which LIBERO's ``ControlEnv`` leaves out. The environment stays there.
+        Fixtures stand as in ``place_fixtures``, and objects in the regions of the BDDL file. The arm is at home, with
+        robosuite's default noise, which LIBERO's ``ControlEnv`` leaves out. The environment keeps this state.
         """
         self._reset_under(seed, initialization_noise="default")
         return self._as_mjcf()
 
     def _reset_under(self, seed: int, **robot: object) -> None:
-        """Reset by LIBERO's own draws under a seed, with other settings of robosuite's robot than usual."""
+        """Reset by LIBERO's own random samples under a seed, with changed settings of robosuite's robot."""
         env = self._env.env
-        # Each reset adds its samplers of open drawers and doors to those of all resets before, and draws from every
-        # one of them: without this, the second placement under a seed differs from the first.
+        # Each reset adds its samplers of open drawers and doors to those of all resets before, and samples from all of
+        # them. Without this deletion, the second placement under a seed differs from the first.
         del env.object_property_initializers[self._openings :]
         self._scene = None
-        usual = env.robot_configs[0]  # each reset makes the robot anew from this
-        env.robot_configs[0] = {**usual, **robot}
+        usual_settings = env.robot_configs[0]  # each reset creates the robot again from these settings
+        env.robot_configs[0] = {**usual_settings, **robot}
         try:
             with seeded(seed):
                 until_placed(env.reset, self.task)
         finally:
-            env.robot_configs[0] = usual
+            env.robot_configs[0] = usual_settings
         self._control_step = ControlStep(env)
 
     def _as_mjcf(self) -> str:
-        """The scene that LIBERO's last reset compiled, with the masses of an evaluation."""
+        """Return the scene that LIBERO's last reset compiled as MJCF, with the masses of an evaluation."""
         scene = ET.fromstring(self._env.sim.model.get_xml())
         as_evaluated(scene)
         return ET.tostring(scene, encoding="unicode")
 
     def restore(self, scene: Scene) -> None:
-        """Put the environment where a scene starts; nothing from before has an effect on what follows.
+        """Put the environment into the start of a scene; earlier steps have no effect on later ones.
 
-        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms.
+        Compiling a scene takes 0.2 to 0.4 s; restoring the last scene again takes 10 ms.
 
         Raises:
-            UnusableSceneError: when MuJoCo or LIBERO refuses the scene, or the state is not of its model.
+            UnusableSceneError: if MuJoCo or LIBERO rejects the scene, or if the state does not fit its model.
         """
         env = self._env.env
         if scene.model_xml != self._scene:
@@ -118,17 +124,17 @@ class Environment:
             try:
                 self._open(scene.model_xml)
             except (ValueError, KeyError, mujoco.FatalError) as error:
-                # What MuJoCo raises when it compiles, and robosuite when a name that it looks up is not in the model.
+                # MuJoCo raises these errors while it compiles; robosuite raises them if the model lacks a name.
                 what = f"the scene is refused ({error!s:.300})"
                 raise UnusableSceneError("scene_refused", what, self.task) from error
             self._check_names()
             self._scene, self._site_rgba = scene.model_xml, env.sim.model.site_rgba.copy()
         else:
-            # The part of the model that LIBERO changes while it steps: the site that shows a lit burner.
+            # While it steps, LIBERO changes one part of the model: the site that shows a lit burner.
             env.sim.model.site_rgba[:] = self._site_rgba
             self._reset_in_place()
         robot = env.robots[0]
-        # Of both fingers; robosuite's gripper survives the reset with its last command.
+        # One number for each finger; robosuite's gripper keeps its last command over the reset.
         robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
         env.sim.reset()
         self._check_state(scene.state)
@@ -137,12 +143,12 @@ class Environment:
             env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
             env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
         env.sim.forward()
-        # As after a reset in an evaluation: the controller knows where the arm is, and its null space pulls the arm to
-        # the posture that it is in, not to robosuite's home posture.
+        # After a reset in an evaluation, the controller knows the arm's posture. Its null space pulls the arm to this
+        # posture, not to robosuite's home posture. Do the same here.
         robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
         if scene.posture_rad is not None:
-            # As where LIBERO-Plus puts an initial state in after a reset with another posture: until the end of its
-            # first substep, the controller takes the arm to be there still.
+            # LIBERO-Plus sets an initial state after a reset with another posture. Until the end of the first substep,
+            # its controller still uses the posture of the reset. Do the same here.
             env.sim.set_state_from_flattened(scene.state)
             env.sim.forward()
         env._post_process()
@@ -150,14 +156,18 @@ class Environment:
         self._push, self._steps = scene.push, 0
 
     def settle(self, steps: int) -> None:
-        """Do nothing for some control steps, with the gripper open, while arm and objects come to rest; as ``step``."""
-        # Before the first look, from which a push counts.
+        """Keep the arm still, with the gripper open, for some control steps, while arm and objects come to rest.
+
+        Raises:
+            RefusedError: see ``step``.
+        """
+        # A push counts its steps from the first observation, which follows the settling.
         self._steps = -steps
         for _ in range(steps):
             self.step(DUMMY_ACTION)
 
     def _open(self, model_xml: str) -> None:
-        """As robosuite's ``reset_from_xml_string``, but a scene that was compiled lately is not compiled again."""
+        """Open a scene like robosuite's ``reset_from_xml_string``, but reuse a recently compiled model."""
         from robosuite.utils.binding_utils import MjSim
 
         env, model = self._env.env, copy.copy(physics_to_read(model_xml))
@@ -168,7 +178,7 @@ class Environment:
         self._reset_in_place()
 
     def _reset_in_place(self) -> None:
-        """LIBERO's reset of the scene that is there, which otherwise would draw one anew."""
+        """Call LIBERO's reset on the current scene; without this setting, LIBERO would sample a new scene."""
         self._env.env.deterministic_reset = True
         try:
             self._env.env.reset()
@@ -176,25 +186,37 @@ class Environment:
             self._env.env.deterministic_reset = False
 
     def _check_names(self) -> None:
-        """What is looked up by name later, besides what LIBERO's own reset has looked up already."""
+        """Check the names that are looked up later and that LIBERO's own reset has not looked up.
+
+        Raises:
+            UnusableSceneError: ``scene_refused`` if the model lacks a camera, joint or working surface.
+        """
         env, model = self._env.env, self._env.env.sim.model
-        needed = {view.camera: model.camera_names for view in SCHEMA.views.values()}
-        needed |= {joint: model.joint_names for thing in env.objects_dict.values() for joint in thing.joints}
-        missing = [name for name, names in needed.items() if name not in names]
+        names_by_needed = {view.camera: model.camera_names for view in SCHEMA.views.values()}
+        for thing in env.objects_dict.values():
+            for joint in thing.joints:
+                names_by_needed[joint] = model.joint_names
+        missing = [needed for needed, names in names_by_needed.items() if needed not in names]
         if not set(SURFACES) & set(model.body_names):
             missing.append(" or ".join(SURFACES))
         if missing:
             raise UnusableSceneError("scene_refused", f"the scene has no {', '.join(missing)}", self.task)
 
     def _check_state(self, state: Floats) -> None:
+        """Check the length of a state (S,) and the rotations in it.
+
+        Raises:
+            UnusableSceneError: ``state_mismatch`` for another length or a rotation of length 0.
+        """
         model = self.sim.model._model
         expected = 1 + model.nq + model.nv
         if len(state) != expected:
             what = f"the recorded state has {len(state)} numbers, the scene's has {expected}"
             raise UnusableSceneError("state_mismatch", what, self.task)
-        free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-        turns = state[4 + model.jnt_qposadr[free, None] + np.arange(4)]
-        for joint in free[~turns.any(axis=1)]:
+        free_joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        # The state begins with the time, and a free joint's qpos begins with its position (3,).
+        rotations = state[4 + model.jnt_qposadr[free_joints, None] + np.arange(4)]
+        for joint in free_joints[~rotations.any(axis=1)]:
             what = f"the recorded state gives {model.joint(joint).name} a rotation of length 0"
             raise UnusableSceneError("state_mismatch", what, self.task)
 
@@ -202,7 +224,7 @@ class Environment:
         """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1].
 
         Raises:
-            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
+            RefusedError: ``simulation_unstable`` if the numbers grow beyond the range that can be computed.
         """
         self._act_from_outside()
         with self._stable():
@@ -210,12 +232,16 @@ class Environment:
 
     @contextmanager
     def _stable(self) -> Iterator[None]:
-        """Raises: RefusedError: ``simulation_unstable`` when numbers grow beyond what can be computed with."""
+        """Turn numerical errors of the simulation into a ``RefusedError``.
+
+        Raises:
+            RefusedError: ``simulation_unstable`` if numbers grow beyond the range that can be computed.
+        """
         try:
             yield
         except (np.linalg.LinAlgError, mujoco.FatalError) as error:
             raise RefusedError("simulation_unstable") from error
-        # MuJoCo then goes on from the model's own pose, and raises nothing.
+        # After too large accelerations, MuJoCo resumes from the model's own pose and raises nothing.
         if self.sim.data._data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             raise RefusedError("simulation_unstable")
 
@@ -228,42 +254,48 @@ class Environment:
 
     @property
     def sim(self) -> Any:
-        """robosuite's ``MjSim`` of the scene restored last, to read from; a later ``restore`` may replace it.
+        """Return robosuite's ``MjSim`` of the last restored scene, to read from; a later ``restore`` may replace it.
 
-        Its textures are plain: render from the scene's MJCF instead. What is written into its model stays there when
-        the same scene is restored again.
+        Its textures are plain: render from the scene's MJCF instead. Changes to its model remain if the same scene is
+        restored again.
         """
         return self._env.sim
 
     @property
     def hand(self) -> tuple[Floats, Rotation]:
-        """Position (3,) in m and orientation of the grip site, in the world's frame."""
+        """Return position (3,) in m and orientation of the grip site, in the world's frame."""
         data = self.sim.data._data
         grip = data.site("gripper0_grip_site")
         return grip.xpos.copy(), Rotation.from_matrix(grip.xmat.reshape(3, 3))
 
     def pose(self, name: str) -> Floats:
-        """(7,) position in m and rotation wxyz of an object, a fixture or a region, by its name in the BDDL file."""
+        """Return the pose (7,), position in m and rotation wxyz, of an object, a fixture or a region.
+
+        Args:
+            name: the thing's name in the BDDL file.
+        """
         data = self.sim.data._data
         joint = f"{name}_joint0"
-        return np.array(data.joint(joint).qpos) if joint in self.sim.model.joint_names else fixed_pose(data, name)
+        if joint in self.sim.model.joint_names:
+            return np.array(data.joint(joint).qpos)
+        return fixed_pose(data, name)
 
     @property
     def state(self) -> Floats:
-        """(S,) flattened MuJoCo state: time, qpos, qvel."""
+        """Return the flattened MuJoCo state (S,): time, qpos, qvel."""
         return np.asarray(self._env.get_sim_state(), np.float64)
 
     @property
     def site_alpha(self) -> NDArray[np.float32]:
-        """(nsite,) opacity of each site; LIBERO lights a stove's burner by making its site visible."""
+        """Return the opacity of each site, (nsite,); LIBERO lights a stove's burner by making its site visible."""
         return np.array(self._env.sim.model.site_rgba[:, 3], np.float32)
 
     def succeeded(self) -> bool:
-        """LIBERO's success check, the conjunction of the BDDL goal's predicates."""
+        """Return LIBERO's success check, the conjunction of the BDDL goal's predicates."""
         return bool(self._env.check_success())
 
     def satisfies(self, goal: Iterable[Sequence[str]]) -> bool:
-        """Whether all facts of a goal hold, such as that of another task in the same scene."""
+        """Return whether all facts of a goal hold, such as the goal of another task in the same scene."""
         return all(self._env.env._eval_predicate(list(fact)) for fact in goal)
 
     def close(self) -> None:
@@ -272,5 +304,5 @@ class Environment:
 
 @lru_cache(maxsize=1)
 def shared(task: Task) -> Environment:
-    """This process's environment for ``task``, for whoever restores it before stepping."""
+    """Return this process's environment for ``task``; restore a scene before you step it."""
     return Environment(task)

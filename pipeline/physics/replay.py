@@ -1,6 +1,6 @@
 """Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory with a verdict out.
 
-And where a scene and a demonstration's actions in it lead, for whoever looks before the replay.
+``roll_out`` and ``first_look`` return the states of a scene before it is replayed, for perturbations that need them.
 """
 
 import sys
@@ -21,7 +21,7 @@ from pipeline.physics.tracking import Route, follow
 from pipeline.types import Demo, Floats, Push, Scene, Task, Trajectory, Verdict
 
 
-# Six arguments: what is replayed, its name, how, under what changes, and what tracking follows.
+# Six arguments: environment, demonstration, name, settings, perturbations, and the reference for tracking.
 def replay(
     environment: Environment,
     demo: Demo,
@@ -30,15 +30,18 @@ def replay(
     perturbations: Sequence[PhysicsPerturbation] = (),
     reference: Callable[[], Reference | None] = lambda: None,
 ) -> Trajectory:
-    """Replay a demonstration from its first state, or a perturbed one, once that has settled, in the configured mode.
+    """Replay a demonstration in the configured mode, once its first state, or a perturbed state, has settled.
 
-    A demonstration whose scene or state cannot be simulated makes a trajectory that is dropped, not an error.
+    If the demonstration's scene or state cannot be simulated, return a dropped trajectory instead of raising an error.
 
     Args:
-        environment: of the demonstration's task.
-        perturbations: what to change before the first step.
-        reference: gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
-            ``tracked``; the result says how its actions came about.
+        environment: the environment of the demonstration's task.
+        demo: the demonstration.
+        trajectory_id: the result's id.
+        config: mode, settling and no-op rule of the replay.
+        perturbations: changes to apply before the first step.
+        reference: returns the reference that tracking follows. If it returns ``None``, the replay is open-loop, also
+            in mode ``tracked``; the result states its mode.
     """
     try:
         scene, refused = _perturbed(environment, demo, config, perturbations)
@@ -49,33 +52,42 @@ def replay(
         dropped = Verdict(False, error.reason)
         return Trajectory(trajectory_id, "open_loop", scene, demo.init_state[None], none, alpha, dropped)
 
+    def no_actions() -> Iterator[Floats]:
+        return iter(())
+
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
-        settle_steps, acting = (0, lambda: iter(())) if refused else (config.settle_steps, policy)
-        states, actions, alphas, judged = _execute(environment, scene, settle_steps, acting)
+        if refused:
+            settle_steps, executed_policy = 0, no_actions
+        else:
+            settle_steps, executed_policy = config.settle_steps, policy
+        states, actions, alphas, judged = _execute(environment, scene, settle_steps, executed_policy)
         if judged.kept and (fault := _fault_of(perturbations, actions)):
             judged = Verdict(False, fault)
         return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused or judged)
 
-    # What is pushed is tracked also where the recorded actions would reach the goal: they do not work against the push.
+    # Recorded actions do not work against a push, so mode ``auto`` tracks pushed scenes even if they reach the goal.
     tracks = config.mode == "tracked" or (config.mode == "auto" and scene.push is not None and not refused)
     followed = reference() if tracks else None
     if followed is None:
-        opened = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
-        if config.mode != "auto" or opened.verdict.kept or refused or (followed := reference()) is None:
-            return opened
+        open_loop = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
+        if config.mode != "auto" or open_loop.verdict.kept or refused:
+            return open_loop
+        followed = reference()
+        if followed is None:
+            return open_loop
     return rollout("tracked", lambda: _tracking(environment, followed))
 
 
 def _execute(
     environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
 ) -> tuple[Floats, Floats, NDArray[np.float32], Verdict]:
-    """Let a scene settle, and then take the actions that ``policy`` makes from there.
+    """Let a scene settle, and then execute the actions that ``policy`` yields.
 
     Returns:
         States, actions, opacity of sites and verdict, as in ``Trajectory``.
     """
     environment.restore(scene)
-    # What has no first look is dropped with the state that it was put in.
+    # If the scene does not settle, store only the initial state.
     states, alphas = [environment.state], [environment.site_alpha]
     actions, succeeded = [], []
     refused = None
@@ -101,7 +113,7 @@ def _fault_of(perturbations: Sequence[PhysicsPerturbation], actions: Floats) -> 
 
 
 def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
-    """The actions that follow a reference from where the restored environment stands."""
+    """Yield the actions that follow a reference from the environment's restored state."""
     poses = {name: environment.pose(name) for name in (*reference.poses, *reference.places)}
     return follow(Route.through(reference, environment.hand, poses), lambda: environment.hand, environment.pose)
 
@@ -109,10 +121,17 @@ def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats
 def _perturbed(
     environment: Environment, demo: Demo, config: ReplayConfig, perturbations: Sequence[PhysicsPerturbation]
 ) -> tuple[Scene, Verdict | None]:
-    """Where the replay starts, and the reason if a perturbation cannot be made there."""
+    """Return the perturbed scene in which the replay starts.
+
+    Returns:
+        The scene; and ``None``, or a verdict with the reason for which a perturbation cannot be applied.
+
+    Raises:
+        UnusableSceneError: if the recorded scene cannot be restored.
+    """
     model_xml = demo.model_xml or environment.place_fixtures(config.fixture_seed)
     scene = recorded_start(demo, model_xml, settles=config.settle_steps > 0)
-    # Before perturbations compile it themselves, which would fail in ways of their own.
+    # Restore the scene first: perturbations compile it too, and would raise other errors.
     environment.restore(scene)
     try:
         for perturbation in perturbations:
@@ -139,10 +158,12 @@ def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
 
 
 def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
-    """(K+1, S) states that the demonstration's actions lead through from ``scene``, once that has settled.
+    """Execute the demonstration's actions from ``scene``, once it has settled, and return the states (K+1, S).
 
     Args:
-        config: how the replay that follows settles, and which actions it leaves out.
+        scene: the scene to start in.
+        demo: the demonstration.
+        config: settling and no-op rule of the later replay.
 
     Raises:
         RefusedError: ``simulation_unstable``.
@@ -152,7 +173,7 @@ def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) ->
 
 
 def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
-    """(S,) what the first frame of a replay shows: the state in which ``scene`` has settled.
+    """Return the state (S,) in which ``scene`` has settled, which the first frame of a replay shows.
 
     Raises:
         RefusedError: ``simulation_unstable``.
@@ -161,7 +182,8 @@ def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
 
 
 def _states_from(scene: Scene, task: Task, actions: Floats, config: ReplayConfig) -> Floats:
-    # All that a replay depends on of the scene, which itself can be no key.
+    """Execute actions from a settled scene and return the states (K+1, S), cached by the scene's content."""
+    # A scene cannot be hashed; these are the parts of it that a replay depends on.
     start = scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad, scene.push
     return _states(task, start, actions.tobytes(), config.settle_steps)
 
@@ -171,6 +193,7 @@ _Start = tuple[str, bytes, float, tuple[float, ...] | None, Push | None]
 
 @lru_cache(maxsize=4)
 def _states(task: Task, start: _Start, actions: bytes, settle_steps: int) -> Floats:
+    """Execute actions (the bytes of (K, 7) float64) from a settled start and return the states (K+1, S)."""
     model_xml, state, gripper, posture_rad, push = start
     environment = shared(task)
     environment.restore(Scene(model_xml, np.frombuffer(state), gripper=gripper, posture_rad=posture_rad, push=push))

@@ -1,4 +1,4 @@
-"""LIBERO's control step without the parts that change no state: the same states, bit for bit."""
+"""LIBERO's control step without the parts that change no state; its states are equal to LIBERO's, bit for bit."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -12,20 +12,22 @@ from pipeline.types import Floats
 class ControlStep:
     """One scene's control step, 50 ms in 25 substeps, as robosuite 1.4.0 takes it.
 
-    A substep of robosuite's runs MuJoCo's whole forward dynamics three times on one state: before the controller,
-    inside the controller's update, and inside ``mj_step``. What can differ between them is the solver, which starts
-    from its last result, and, once torques are set, what follows from them. So the second is the constraint solver
-    alone and the third is ``mj_step2``. None of the solves can be left out: each changes the start of the next by very
-    little, and contacts amplify that to decimetres before a demonstration ends.
+    A substep of robosuite runs MuJoCo's whole forward dynamics three times on one state: before the controller, inside
+    the controller's update, and inside ``mj_step``. Two results can differ between the three runs. The solver starts
+    from its last result. Once torques are set, the quantities that depend on them change. So here the second run is
+    the constraint solver alone and the third run is ``mj_step2``. No solve can be left out: each solve changes the
+    start of the next by very little, and contacts amplify this to decimetres before a demonstration ends.
 
-    Of ``mj_step``, only its check for positions and velocities beyond 1e10 is missing; that of accelerations, which
-    comes first when a scene explodes, is part of ``mj_step2``. LIBERO's scenes are integrated by Euler's method.
+    Only one part of ``mj_step`` is missing: its check for positions and velocities beyond 1e10. The check of
+    accelerations, which fails first when a scene explodes, is part of ``mj_step2``. LIBERO's scenes are integrated by
+    Euler's method.
 
-    The controller is robosuite's own and computes the torques; only its ``update`` is replaced here. Observables,
-    rewards and buffers of recent values, which change no state, are left out.
+    robosuite's own controller computes the torques; only its ``update`` is replaced here. Observables, rewards and
+    buffers of recent values change no state and are left out.
 
     Args:
-        env: LIBERO's environment (the one inside ``ControlEnv``), restored; a later reset of it needs a new instance.
+        env: LIBERO's restored environment (the object inside ``ControlEnv``). After a later reset of it, create a new
+            ``ControlStep``.
     """
 
     def __init__(self, env: Any):
@@ -36,10 +38,9 @@ class ControlStep:
         self._substeps = int(env.control_timestep / env.model_timestep)
         self._site = env.sim.model.site_name2id(self._controller.eef_name)
         # The joints of an arm, which is a chain of bodies, have consecutive addresses.
-        self._arm_qpos, self._arm_dofs = (
-            slice(first, first + self._controller.joint_dim)
-            for first in (self._controller.qpos_index[0], self._controller.qvel_index[0])
-        )
+        first_qpos, first_dof = self._controller.qpos_index[0], self._controller.qvel_index[0]
+        self._arm_qpos = slice(first_qpos, first_qpos + self._controller.joint_dim)
+        self._arm_dofs = slice(first_dof, first_dof + self._controller.joint_dim)
         self._jacobian, self._mass = np.empty((6, self._model.nv)), np.empty((self._model.nv, self._model.nv))
         self._positional, self._rotational = self._jacobian[:3], self._jacobian[3:]
         self._arm_torque = robot._ref_joint_actuator_indexes
@@ -49,7 +50,7 @@ class ControlStep:
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
 
     def __call__(self, action: Floats) -> None:
-        """Take the step.
+        """Execute the control step.
 
         Args:
             action: (7,) OSC_POSE deltas and gripper; the controller clips the deltas to [-1, 1].
@@ -58,10 +59,10 @@ class ControlStep:
             pass
 
     def substeps(self, action: Floats) -> Iterator[None]:
-        """Take the step and stop after each substep.
+        """Execute the control step and yield after each substep.
 
-        Positions and velocities are then those after the substep, and what follows from them, such as where sites are,
-        is still that before it, as when robosuite observes.
+        At each yield, positions and velocities are up to date. Quantities derived from them, such as positions of
+        sites, are still those before the substep. robosuite observes in this state too.
         """
         model, data, controller = self._model, self._data, self._controller
         for substep in range(self._substeps):
@@ -79,7 +80,9 @@ class ControlStep:
         self._env._post_process()
 
     def _update(self) -> None:
-        """Give the controller what its own ``update`` would read, computed once and from addresses already known.
+        """Give the controller the values that its own ``update`` would read.
+
+        They are computed once, and the arm's addresses are not looked up again.
 
         Jacobians and mass matrix are stored by columns, as robosuite's indexing leaves them: the layout selects the
         BLAS routine, and the routine determines the last bits.

@@ -1,8 +1,8 @@
-"""What a trajectory does one after the other, in plain words, from contacts, joints and the gripper's commands.
+"""Subtasks of a trajectory in plain words, from contacts, joints and the gripper's commands.
 
-An object of the goal that is lifted: approach it, grasp it, move it to its place, place it there. One that is moved
-without that is pushed. A drawer, door or knob of the goal: approach it, then open, close or turn it. A subtask lasts
-until the next begins, so that one of them is active at each step.
+A lifted object of the goal has four subtasks: approach it, grasp it, move it to its place, place it there. An object
+that is moved without being lifted is pushed. A drawer, door or knob of the goal has two: approach it, then open, close
+or turn it. A subtask lasts until the next begins, so exactly one subtask is active at each step.
 """
 
 from collections.abc import Iterator
@@ -20,18 +20,24 @@ from pipeline.scenes.compiled import CompiledScene
 from pipeline.types import Floats, State, Subtask, Task, Trajectory
 
 SHORTEST = 5
-"""Steps between the beginnings of two subtasks, at least: 0.25 s. lerobot 0.6.1 takes what began within 0.1 s of a
-frame as begun there (``EMITTED_AT_TOLERANCE_S`` in ``datasets/language_render.py``), and fails where two have."""
+"""Least number of steps (0.25 s) between the beginnings of two subtasks.
+
+lerobot 0.6.1 assigns a subtask that began within 0.1 s of a frame to this frame (``EMITTED_AT_TOLERANCE_S`` in
+``datasets/language_render.py``). It fails if a frame gets two subtasks.
+"""
 
 GAP = 10
-"""So many steps, half a second, the robot may let go of something it is not done with."""
+"""Longest gap in steps (0.5 s) during which the robot may release a thing and still be manipulating it."""
 
 MOVED_M, LIFTED_M = 0.02, 0.01
-"""How far an object goes that is moved, and that is lifted where it slides along what it stands on."""
+"""Least displacements of a moved object, and of a gripped object that counts as lifted though it slides on its support.
+"""
 
 TURNED, MOVING = 0.1, 0.005
-"""Shares of its range by which a drawer, door or knob moves in all, and in a step: the hand may knock a door shut with
-no contact at the moments that are stored."""
+"""Least shares of its range by which a drawer, door or knob moves in all, and in a step in which it counts as moving.
+
+Contacts alone do not suffice: the hand may knock a door shut without contact in any stored state.
+"""
 
 VERBS = {
     "open": ("open", "close"),
@@ -39,11 +45,11 @@ VERBS = {
     "turnon": ("turn on", "turn off"),
     "turnoff": ("turn off", "turn on"),
 }
-"""State to what brings something into it, and out of it."""
+"""State to the verbs that bring a thing into this state, and out of it."""
 
 
 class _Deed(NamedTuple):
-    """What is done with one thing, from the step at which it is reached until it is left."""
+    """Manipulation of one thing, from the step at which it is reached until it is left."""
 
     reached: int
     left: int
@@ -52,23 +58,27 @@ class _Deed(NamedTuple):
 
 
 def subtasks(trajectory: Trajectory, task: Task) -> tuple[Subtask, ...]:
-    """The subtasks of a trajectory, the first from step 0; none where it leaves alone what the goal names.
+    """Return the subtasks of a trajectory; the first begins at step 0.
 
-    Takes 0.3 ms a step, where the scene is compiled already.
+    The result is empty if the trajectory manipulates nothing that the goal names. This takes 0.3 ms a step if the scene
+    is compiled already.
 
     Raises:
-        ValueError: when MuJoCo refuses the scene.
+        ValueError: if MuJoCo rejects the scene.
     """
-    known, seen = bddl.read(task.bddl_file), _Seen(trajectory)
-    found: list[Subtask] = []
+    problem, seen = bddl.read(task.bddl_file), _Seen(trajectory)
+    deeds: set[_Deed] = set()
+    for fact in problem.goal:
+        deeds.update(seen.deeds(problem, fact))
+    sequence: list[Subtask] = []
     begin = 0
-    for deed in sorted({deed for fact in known.goal for deed in seen.deeds(known, fact)}):
+    for deed in sorted(deeds):
         for step, text in (Subtask(begin, f"approach {deed.thing}"), *deed.subtasks):
-            at = max(step, found[-1].step + SHORTEST) if found else 0
-            if at < len(trajectory.actions):
-                found.append(Subtask(at, text))
+            first_step = max(step, sequence[-1].step + SHORTEST) if sequence else 0
+            if first_step < len(trajectory.actions):
+                sequence.append(Subtask(first_step, text))
         begin = deed.left
-    return tuple(found)
+    return tuple(sequence)
 
 
 class _Seen:
@@ -85,48 +95,57 @@ class _Seen:
             self.pairs.append(scene.contacts)
         self.robot = self._below(self.model.body("robot0_base").id)
 
-    def deeds(self, known: Bddl, fact: Fact) -> Iterator[_Deed]:
-        """What is done for a fact of the goal."""
-        if fact[1] in known.targets:
-            yield from self._with_object(known, fact)
-        if {*known.things_named(fact[-1:])} & known.fixtures.keys():
-            yield from self._with_part(known, fact)
+    def deeds(self, problem: Bddl, fact: Fact) -> Iterator[_Deed]:
+        """Yield the manipulations that belong to a fact of the goal."""
+        if fact[1] in problem.targets:
+            yield from self._with_object(problem, fact)
+        if {*problem.things_named(fact[-1:])} & problem.fixtures.keys():
+            yield from self._with_part(problem, fact)
 
-    def _with_object(self, known: Bddl, fact: Fact) -> Iterator[_Deed]:
-        own = self._below(self.model.body(f"{fact[1]}_main").id)
-        fingers = [self._below(self.model.body(f"gripper0_{side}finger").id) for side in ("left", "right")]
-        gripped = self._touch(own, fingers[0]) & self._touch(own, fingers[1]) & self.closing
-        resting = self._touch(own, ~own & ~self.robot)
+    def _with_object(self, problem: Bddl, fact: Fact) -> Iterator[_Deed]:
+        """Yield the manipulations of the fact's movable object: it is pushed, or grasped, moved and placed."""
+        body = self._below(self.model.body(f"{fact[1]}_main").id)
+        left_finger = self._below(self.model.body("gripper0_leftfinger").id)
+        right_finger = self._below(self.model.body("gripper0_rightfinger").id)
+        gripped = self._touch(body, left_finger) & self._touch(body, right_finger) & self.closing
+        resting = self._touch(body, ~body & ~self.robot)
         first = int(self.model.joint(f"{fact[1]}_joint0").qposadr[0])
         place = self.qpos[:, first : first + 3]
-        thing = called(known, fact[1])
-        to, at = where(known, fact)
-        for reached, left in _runs(self._touch(own, self.robot)):
+        thing = called(problem, fact[1])
+        to, at = where(problem, fact)
+        for reached, left in _runs(self._touch(body, self.robot)):
             grips = np.flatnonzero(gripped[:left])
             grips = grips[grips >= reached]
-            lifted = grips[~resting[grips] | (_far(place[grips], place[grips[:1]]) >= LIFTED_M)]
-            if _far(place[reached : left + 1], place[reached]).max() < MOVED_M:
+            lifted = grips[~resting[grips] | (_distances(place[grips], place[grips[:1]]) >= LIFTED_M)]
+            if _distances(place[reached : left + 1], place[reached]).max() < MOVED_M:
                 continue
             if not len(lifted):
                 yield _Deed(reached, left, thing, (Subtask(reached, f"push {thing} {to}"),))
                 continue
             grasp = np.flatnonzero(~self.closing[: lifted[0]]).max(initial=-1) + 1
-            let_go = int(grips[-1]) + 1
-            down = [start for start, end in _runs(resting[:let_go]) if start > lifted[0] + GAP and end > let_go - GAP]
-            steps = (int(grasp), int(lifted[0]), *down[-1:], let_go)
+            release = int(grips[-1]) + 1
+            # Steps at which the lifted object comes to rest and stays at rest until about its release.
+            put_down = []
+            for start, end in _runs(resting[:release]):
+                if start > lifted[0] + GAP and end > release - GAP:
+                    put_down.append(start)
+            # ``map`` ends with the three texts, so the release is used only if the object was not put down before.
+            steps = (int(grasp), int(lifted[0]), *put_down[-1:], release)
             texts = (f"grasp {thing}", f"move {thing} {to}", f"place {thing} {at}")
             yield _Deed(reached, left, thing, tuple(map(Subtask, steps, texts)))
 
-    def _with_part(self, known: Bddl, fact: Fact) -> Iterator[_Deed]:
+    def _with_part(self, problem: Bddl, fact: Fact) -> Iterator[_Deed]:
+        """Yield the manipulations of the fact's drawer, door or knob: each turn of one of its joints."""
         name, state = fact[-1], fact[0] if len(fact) == 2 else "open"
         site = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, name)
-        bodies = (
-            [self.model.site_bodyid[site]]
-            if site >= 0
-            else np.flatnonzero(self._below(self.model.body(f"{name}_main").id))
-        )
-        thing = called(known, name)
-        verbs = VERBS[state][:: -1 if (state, name) in known.start else 1]
+        if site >= 0:
+            bodies = [self.model.site_bodyid[site]]
+        else:
+            bodies = np.flatnonzero(self._below(self.model.body(f"{name}_main").id)).tolist()
+        thing = called(problem, name)
+        verbs = VERBS[state]
+        if (state, name) in problem.start:
+            verbs = verbs[::-1]
         for joint in np.flatnonzero(np.isin(self.model.jnt_bodyid, bodies)):
             turned = self.qpos[:, self.model.jnt_qposadr[joint]] / np.ptp(self.model.jnt_range[joint])
             touched = self._touch(self._below(self.model.jnt_bodyid[joint]), self.robot)
@@ -136,21 +155,28 @@ class _Seen:
                 yield _Deed(reached, left, thing, (Subtask(reached, f"{verb} {thing}"),))
 
     def _below(self, body: int) -> Mask:
-        """(nbody,) whether it is this body, or moves with it; MuJoCo numbers a body after its parent."""
+        """Return a mask (nbody,) of a body and the bodies that move with it.
+
+        MuJoCo numbers a body after its parent.
+        """
         below: Mask = np.arange(self.model.nbody) == body
-        for each in range(int(body) + 1, self.model.nbody):
-            below[each] = below[self.model.body_parentid[each]]
+        for later_body in range(int(body) + 1, self.model.nbody):
+            below[later_body] = below[self.model.body_parentid[later_body]]
         return below
 
-    def _touch(self, one: Mask, other: Mask) -> Mask:
-        """(K+1,) whether any of these bodies touches any of the others."""
-        return np.array([bool((one[pairs] & other[pairs[:, ::-1]]).any()) for pairs in self.pairs])
+    def _touch(self, first: Mask, second: Mask) -> Mask:
+        """Return a mask (K+1,) of the states in which any body of ``first`` touches any body of ``second``."""
+        return np.array([bool((first[pairs] & second[pairs[:, ::-1]]).any()) for pairs in self.pairs])
 
 
-def _far(one: Floats, other: Floats) -> Floats:
-    return np.asarray(np.linalg.norm(one - other, axis=1))
+def _distances(places: Floats, origin: Floats) -> Floats:
+    """Return the distance of each place (N, 3) from an origin, (3,) or (1, 3)."""
+    return np.asarray(np.linalg.norm(places - origin, axis=1))
 
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:
-    """First step, and the one after the last, of each stretch of a mask, with gaps of ``GAP`` at most in it."""
+    """Return the first step, and the step after the last, of each stretch of a mask.
+
+    A stretch may have gaps of at most ``GAP`` steps.
+    """
     return [(first, last + 1) for first, last in runs(mask, GAP + 1)]

@@ -1,6 +1,6 @@
-"""The rendering of a scene by MuJoCo's public functions alone.
+"""Rendering of a scene by MuJoCo's public functions alone.
 
-Any other drawing (``savings.py``) must give the same pixels.
+Any other drawing (``savings.py``) must render equal pixels.
 """
 
 from collections.abc import Collection
@@ -18,15 +18,15 @@ from pipeline.rendering.opengl import check, making_context
 from pipeline.types import Frame
 
 MOST_GEOMS = 1000
-"""Geoms, sites and the like of a scene that MuJoCo renders at most; LIBERO's scenes have up to 300."""
+"""Largest number of geoms, sites and other elements of a scene that MuJoCo renders; LIBERO's scenes have up to 300."""
 
 
 class Surfaces(NamedTuple):
-    """What each pixel shows, in the orientation of LIBERO's raw observations.
+    """Depth, and geom or site, of each pixel, in the orientation of LIBERO's raw observations.
 
     Attributes:
-        depth_m: (H, W) float32, along the axis that the camera looks along.
-        number, kind: (H, W) the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 for none.
+        depth_m: (H, W) float32, along the camera's viewing axis.
+        number, kind: (H, W) the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 without a surface.
     """
 
     depth_m: NDArray[np.float32]
@@ -35,19 +35,19 @@ class Surfaces(NamedTuple):
 
 
 def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> list[NDArray[np.uint8]]:
-    """The part of a model's ``tex_data``, or of another array like it, that belongs to each texture; not copied."""
+    """Return a view of each texture's part of a model's ``tex_data``, or of another array of this layout."""
     data = model.tex_data if tex_data is None else tex_data
     ends = model.tex_adr + model.tex_height * model.tex_width * model.tex_nchannel
     return [data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
 
 
 class PlainDrawing:
-    """Renders all of a model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in a context of its own.
+    """Drawing of a whole model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in its own context.
 
-    Close it before another is made.
+    Close it before you create another drawing.
 
     Raises:
-        PipelineError: when nothing renders on this machine.
+        PipelineError: if this machine cannot render.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -56,7 +56,7 @@ class PlainDrawing:
         self._model, self._rectangle = model, mujoco.MjrRect(0, 0, width, height)
         self._gl = gl_context.GLContext(width, height)
         with ExitStack() as undo:
-            # An OpenGL context that is left open counts against those that the driver has.
+            # The driver has a limited number of OpenGL contexts, so free the context after an error.
             undo.callback(self._gl.free)
             self._gl.make_current()
             with making_context():
@@ -67,52 +67,56 @@ class PlainDrawing:
         self._scene = mujoco.MjvScene(model, MOST_GEOMS)
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        # As robosuite's off-screen context: visual meshes without the collision geometry.
+        # Render visual meshes without the collision geometry, like robosuite's off-screen context.
         self._option.geomgroup[0] = 0
 
     def adopt(self, model: mujoco.MjModel) -> bool:
-        """Go on with another model in the same OpenGL context, if that is possible; here it is not.
+        """Switch to another model in the same OpenGL context if possible, and return whether it was; here it never is.
 
-        If it returns False, nothing has changed. If it raises, the drawing has to be closed.
+        If the result is False, nothing has changed. After an error, the drawing has to be closed.
         """
         return False
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:
-        """(H, W, 3) uint8 RGB in the orientation of LIBERO's raw observations; ``mj_forward`` has to be done."""
+        """Render a frame (H, W, 3) of uint8 RGB, in the orientation of LIBERO's raw observations.
+
+        Call ``mj_forward`` on the data before.
+        """
         self._gl.make_current()
         self._update(data, camera)
         self._render()
         return self._pixels()
 
     def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
-        """What each pixel of a frame shows."""
+        """Render the depth, and the geom or site, of each pixel of a frame."""
         self._gl.make_current()
         groups = self._model.site_group.copy()
-        # robosuite hides sites by a negative opacity. A segmentation would show all that are not at 0.
+        # robosuite hides sites by a negative opacity. A segmentation would show all sites with an opacity other than 0.
         self._model.site_group[self._model.site_rgba[:, 3] <= 0] = mujoco.mjNGROUP - 1
         try:
             self._update(data, camera)
         finally:
             self._model.site_group[:] = groups
-        # A geom's colour is its number in the scene, and one more.
+        # A segmentation renders each geom in the colour ``segid + 1``.
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
         try:
             self._render()
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
-        place = self._pixels().astype(np.uint32) @ np.array([1, 2**8, 2**16], np.uint32)
-        shown = np.full((self._scene.ngeom + 1, 2), -1, np.int32)
+        colours = self._pixels().astype(np.uint32) @ np.array([1, 2**8, 2**16], np.uint32)
+        object_of_colour = np.full((self._scene.ngeom + 1, 2), -1, np.int32)
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0:
-                shown[geom.segid + 1] = geom.objid, geom.objtype
-        buffer = np.empty(place.shape, np.float32)
+                object_of_colour[geom.segid + 1] = geom.objid, geom.objtype
+        buffer = np.empty(colours.shape, np.float32)
         mujoco.mjr_readPixels(None, buffer, self._rectangle, self._context)
         check("mjr_readPixels")
         near, far = np.array([self._model.vis.map.znear, self._model.vis.map.zfar]) * self._model.stat.extent
-        # MuJoCo's buffer is 1 at the near plane and 0 at the far one, as mujoco.Renderer inverts it.
+        # MuJoCo's buffer is 1 at the near plane and 0 at the far plane; mujoco.Renderer inverts it in the same way.
         depth_m = near * far / (near + buffer.astype(float) * (far - near))
-        return Surfaces(depth_m.astype(np.float32), *np.moveaxis(shown[place], -1, 0))
+        number, kind = np.moveaxis(object_of_colour[colours], -1, 0)
+        return Surfaces(depth_m.astype(np.float32), number, kind)
 
     def load(self, textures: Collection[int]) -> None:
         """Upload these textures from the model's ``tex_data``."""

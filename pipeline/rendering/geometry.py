@@ -1,6 +1,6 @@
-"""Camera matrices, depth and segmentation of a view, and which thing an instance id stands for.
+"""Camera matrices, depth and segmentation of a view, and the table of instance ids.
 
-Conventions are those of ``schemas/episode.json``.
+All conventions follow ``schemas/episode.json``.
 """
 
 from collections.abc import Collection
@@ -20,16 +20,22 @@ from pipeline.rendering.renderer import Renderer
 from pipeline.types import Extra, Floats, Geometry, Task, Trajectory
 
 COMMON = ("nothing", "robot", "gripper", "floor", "wall", "room", "table")
-"""The first names of every table. ``nothing`` is where no surface is, ``room`` other furniture."""
+"""First names of every table. ``nothing`` marks pixels without a surface, ``room`` other furniture."""
 
 NOTHING, ROBOT, GRIPPER, FLOOR, WALL, ROOM, TABLE = range(len(COMMON))
 
 
 class Instances:
-    """The table of names of a trajectory, and what of its model belongs to which.
+    """Table of a trajectory's instance names, and the bodies, geoms and sites of each name.
 
-    After ``COMMON`` come the fixtures and then the objects in the order of the task's BDDL file, under their names
-    there, so that an id means the same in all episodes of a task. Objects that the layout axis added come last.
+    After ``COMMON`` come the fixtures and then the objects, in the order and under the names of the task's BDDL file.
+    Thus an id has one meaning in all episodes of a task. Objects that the layout axis added come last.
+
+    Attributes:
+        names: the name of each id.
+
+    Raises:
+        PipelineError: if the scene has more things than ``object_poses`` has rows.
     """
 
     def __init__(self, model: mujoco.MjModel, trajectory: Trajectory, task: Task):
@@ -44,10 +50,12 @@ class Instances:
         for body, name in enumerate(bodies):
             if name.endswith("table") and model.body_parentid[body] == 0:
                 self._bodies[TABLE] = body
-        own = [*(f"{thing}_main" for thing in things), *(f"layout{number}" for number in range(len(added)))]
-        self._bodies |= {len(COMMON) + place: model.body(name).id for place, name in enumerate(own)}
-        place_of_tree = {body: place for place, body in self._bodies.items() if place != GRIPPER}
-        of_body = np.array([place_of_tree.get(int(root), ROOM) for root in model.body_rootid], np.uint8)
+        thing_bodies = [f"{thing}_main" for thing in things]
+        thing_bodies += [f"layout{number}" for number in range(len(added))]
+        for instance, body_name in enumerate(thing_bodies, start=len(COMMON)):
+            self._bodies[instance] = model.body(body_name).id
+        instance_of_root = {body: instance for instance, body in self._bodies.items() if instance != GRIPPER}
+        of_body = np.array([instance_of_root.get(int(root), ROOM) for root in model.body_rootid], np.uint8)
         of_body[[name.startswith("gripper0_") for name in bodies]] = GRIPPER
         self._of_geom = of_body[model.geom_bodyid]
         for geom in np.flatnonzero(self._of_geom == ROOM).tolist():
@@ -59,26 +67,32 @@ class Instances:
         self._of_site = of_body[model.site_bodyid]
 
     def ids(self, surfaces: Surfaces) -> NDArray[np.uint8]:
-        """(H, W) place in ``names`` of what each pixel shows."""
+        """Return the instance id of each pixel, (H, W): the place in ``names`` of the thing that it shows."""
         ids = np.full(surfaces.number.shape, NOTHING, np.uint8)
         for kind, of_number in ((mujoco.mjtObj.mjOBJ_GEOM, self._of_geom), (mujoco.mjtObj.mjOBJ_SITE, self._of_site)):
-            shown = surfaces.kind == kind
-            ids[shown] = of_number[surfaces.number[shown]]
+            pixels = surfaces.kind == kind
+            ids[pixels] = of_number[surfaces.number[pixels]]
         return ids
 
     def poses(self, data: mujoco.MjData) -> NDArray[np.float32]:
-        """Position (m) and quaternion (w, x, y, z) in the world of the body of each name, zeros where it has none."""
+        """Return position (m) and quaternion (w, x, y, z) of each name's body in the world.
+
+        Rows of names without a body are zero.
+        """
         poses: NDArray[Any] = np.zeros(SCHEMA.object_poses.shape, SCHEMA.object_poses.dtype)
-        for place, body in self._bodies.items():
-            poses[place] = *data.xpos[body], *data.xquat[body]
+        for instance, body in self._bodies.items():
+            poses[instance] = *data.xpos[body], *data.xquat[body]
         return poses
 
 
 def see(
     renderer: Renderer, trajectory: Trajectory, stream: Stream, instances: Instances | None, extras: Collection[Extra]
 ) -> Geometry:
-    """The geometry of a view of a trajectory's scene: its matrices, and with extras its depth and segmentation before
-    each executed action, by the ids of ``instances``."""
+    """Render the geometry of a stream's view of a trajectory.
+
+    The geometry has the camera matrices. With extras, it also has depth, and segmentation by the ids of ``instances``,
+    before each executed action.
+    """
     view = SCHEMA.views[stream.view]
     maps: dict[Extra, list[bytes]] = {name: [] for name in MAPS if name in extras}
     with renderer.perturbed(stream.changes):
@@ -95,10 +109,10 @@ def see(
 
 
 def matrices(renderer: Renderer, view: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Intrinsics (3, 3) and extrinsics (4, 4) of a view in the restored state; the same in every state.
+    """Return intrinsics (3, 3) and extrinsics (4, 4) of a view in the restored state; they are equal in every state.
 
-    LIBERO's raw frames have their first row at the bottom; turned by 180 degrees, they are upright and have left and
-    right exchanged. A rotation cannot mirror, so this stands in the sign of fx.
+    LIBERO's raw frames have their first row at the bottom. Turned by 180 degrees, they are upright, but left and right
+    are exchanged. A rotation cannot mirror, so fx is negative.
     """
     model, data = renderer.model, renderer.data
     spec = SCHEMA.views[view]
@@ -109,20 +123,20 @@ def matrices(renderer: Renderer, view: str) -> tuple[NDArray[np.float32], NDArra
     # MuJoCo's cameras have y up and look along -z.
     extrinsics = _pose(data.cam_xmat[camera].reshape(3, 3) * [1.0, -1.0, -1.0], data.cam_xpos[camera])
     if spec.seen_from == "end_effector":
-        # As the state has it: where the grip site is, turned as the hand is.
+        # The end effector's pose is defined as in the state: position of the grip site, rotation of the hand.
         hand = _pose(data.body("robot0_right_hand").xmat.reshape(3, 3), data.site("gripper0_grip_site").xpos)
         extrinsics = np.linalg.inv(hand) @ extrinsics
     return intrinsics.astype(np.float32), extrinsics.astype(np.float32)
 
 
 def _pose(rotation: Floats, position_m: Floats) -> Floats:
-    """(4, 4) of a rotation (3, 3) and a position (3,)."""
+    """Return the transformation (4, 4) of a rotation (3, 3) and a position (3,)."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, position_m
     return pose
 
 
 def _in_units(depth_m: NDArray[np.float32]) -> NDArray[Any]:
-    """Depth (H, W) as whole numbers of the schema's unit, the largest number for all that is further away."""
+    """Convert depth (H, W) to whole numbers of the schema's unit; larger depths become the largest number."""
     furthest = np.iinfo(SCHEMA.depth.dtype).max
     return np.asarray(np.minimum(np.rint(depth_m / SCHEMA.depth.unit_m), furthest).astype(SCHEMA.depth.dtype))

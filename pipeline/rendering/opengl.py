@@ -1,7 +1,7 @@
 """OpenGL's functions for the current context, with every error checked.
 
-An error means that OpenGL did not do what it was asked to. PyOpenGL checks after each call of ours. MuJoCo does not
-check after its own calls, so each of them that renders, uploads or reads is followed by ``check``.
+An error means that OpenGL did not execute a command. PyOpenGL checks after each call of the pipeline. MuJoCo does not
+check after its own calls, so ``check`` follows each MuJoCo call that renders, uploads or reads.
 """
 
 import functools
@@ -25,7 +25,7 @@ ERRORS = {
     0x0506: "GL_INVALID_FRAMEBUFFER_OPERATION",
     0x0507: "GL_CONTEXT_LOST",
 }
-"""OpenGL's errors by code. Those up to GL_INVALID_OPERATION skip one command and change nothing else."""
+"""OpenGL's errors by code. Errors up to GL_INVALID_OPERATION skip one command and change nothing else."""
 
 OTHERS = "calls that are not the pipeline's"
 
@@ -33,10 +33,10 @@ LEFT = {
     "mjr_render": ("GL_INVALID_ENUM",),
     OTHERS: ("GL_INVALID_ENUM", "GL_INVALID_VALUE", "GL_INVALID_OPERATION"),
 }
-"""Errors that are logged and ignored, by the call that they come from.
+"""Errors that are logged and ignored, by the call that causes them.
 
-In LIBERO's five arenas MuJoCo 3.2.7 causes none. In a scene with more lights than OpenGL has (8 in Mesa, the head light
-is one of them) it also enables and disables those that do not exist; they stay dark.
+In LIBERO's five arenas, MuJoCo 3.2.7 causes no error. OpenGL has a limited number of lights: 8 in Mesa, including the
+head light. In a scene with more lights, MuJoCo also enables and disables lights that OpenGL lacks; they stay dark.
 """
 
 _MEMORY = "fewer workers on this machine (compute.workers), smaller textures, or a GPU with more memory"
@@ -44,24 +44,28 @@ _DRIVER = "MUJOCO_GL=osmesa, which renders in software; and report this message 
 
 
 def calls() -> Any:
-    """PyOpenGL's functions and constants for the current context, which is one of MuJoCo's.
+    """Return PyOpenGL's functions and constants for the current context, which a MuJoCo context owns.
 
-    A function raises PipelineError where OpenGL reports an error of it.
+    A function raises ``PipelineError`` if OpenGL reports an error of its call.
+
+    Raises:
+        PipelineError: see ``check``, for an earlier call that is not the pipeline's.
     """
     check(OTHERS)
     return _FUNCTIONS
 
 
 def check(call: str) -> None:
-    """Look for errors after a call of MuJoCo's, or of ``OTHERS``; those in ``LEFT`` are logged, once a process.
+    """Check for errors after a call of MuJoCo's, or of ``OTHERS``; log errors in ``LEFT`` once a process.
 
     Raises:
-        PipelineError: for any other, such as GL_OUT_OF_MEMORY.
+        PipelineError: for any error that is not in ``LEFT``, such as GL_OUT_OF_MEMORY.
     """
-    # OpenGL keeps one error of each kind.
+    # OpenGL stores one error of each kind.
     for _ in ERRORS:
-        # MuJoCo's glGetError; a third of what it takes through PyOpenGL.
-        if not (code := mujoco.mjr_getError()):
+        # MuJoCo's glGetError takes a third of the time of PyOpenGL's.
+        code = mujoco.mjr_getError()
+        if not code:
             return
         error = ERRORS.get(code, hex(code))
         if error not in LEFT.get(call, ()):
@@ -71,27 +75,30 @@ def check(call: str) -> None:
 
 @functools.cache
 def say_once(error: str, call: str) -> None:
-    logging.getLogger(__name__).warning("OpenGL reports %s in %s; it is passed over and not said again", error, call)
+    """Log an ignored error, once a process for each error and call."""
+    logging.getLogger(__name__).warning(
+        "OpenGL reports %s in %s; this error is ignored and not logged again", error, call
+    )
 
 
 @contextmanager
 def making_context() -> Iterator[None]:
-    """Raise the OpenGL errors that MuJoCo only warns of while it makes a context.
+    """Raise the OpenGL errors of which MuJoCo only warns while it creates a context.
 
     Raises:
-        PipelineError: when it reports any, or makes none.
+        PipelineError: if MuJoCo reports an OpenGL error, or cannot create the context.
     """
-    said: list[str] = []
+    warnings: list[str] = []
     former = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(said.append)
+    mujoco.set_mju_user_warning(warnings.append)
     try:
         yield
     except mujoco.FatalError as error:
         raise failure(f"MuJoCo makes no OpenGL context: {error}", f"{_MEMORY}; or {_DRIVER}") from error
     finally:
         mujoco.set_mju_user_warning(former)
-    for warning in said:
-        # "OpenGL error 0x505 in or before mjr_makeContext"
+    for warning in warnings:
+        # Example: "OpenGL error 0x505 in or before mjr_makeContext"
         if warning.startswith("OpenGL error "):
             code = int(warning.split()[2], 16)
             raise _reported(ERRORS.get(code, hex(code)), "mjr_makeContext")
@@ -100,23 +107,26 @@ def making_context() -> Iterator[None]:
 
 
 class _Functions:
-    """What PyOpenGL has, looked up when it is first asked for, and by then a context is there: it chooses its platform
-    when it is imported."""
+    """PyOpenGL's functions and constants, each looked up at its first use.
+
+    PyOpenGL chooses its platform when it is imported, so it must be imported after a context exists.
+    """
 
     def __getattr__(self, name: str) -> Any:
         from OpenGL import GL
 
-        found = getattr(GL, name)
+        attribute = getattr(GL, name)
         if name.startswith("gl"):
-            found = _stopping(name, found)
-        setattr(self, name, found)
-        return found
+            attribute = _stopping(name, attribute)
+        setattr(self, name, attribute)
+        return attribute
 
 
 _FUNCTIONS = _Functions()
 
 
 def _stopping(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a function of PyOpenGL so that it raises ``PipelineError`` for its OpenGL errors."""
     from OpenGL.error import GLError
 
     def call(*arguments: Any) -> Any:
@@ -129,10 +139,11 @@ def _stopping(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _reported(error: str, call: str) -> PipelineError:
+    """Return the error to raise for an OpenGL error in a call."""
     remedy = _MEMORY if error == "GL_OUT_OF_MEMORY" else _DRIVER
     return failure(f"OpenGL reports {error} in {call}, so that pictures may be wrong", remedy)
 
 
 def failure(what: str, remedy: str = _DRIVER) -> PipelineError:
-    """What this machine's OpenGL does not do."""
+    """Return the error to raise for a failure of this machine's OpenGL."""
     return PipelineError(what, where=f"OpenGL on {gl.choose().device}", remedy=remedy)

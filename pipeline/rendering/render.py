@@ -1,6 +1,7 @@
-"""A trajectory to frames: each frame comes from a stored state, so one replay is rendered under many perturbations.
+"""Rendering of a trajectory to frames.
 
-A frame takes five steps: perturb, restore, render, add noise, turn.
+Each frame comes from a stored state, so one replay is rendered under many perturbations. A frame takes five steps:
+perturb, restore, render, add noise, turn.
 """
 
 from collections.abc import Sequence
@@ -26,9 +27,8 @@ def render(
 ) -> Rendered:
     """Render the streams of one trajectory of a task: the frame before each executed action.
 
-    Streams with the same render perturbations share a scene and its clean frames. A stream is rejected, with a reason,
-    when the first frame of its scene is refused (``FirstFrame``). Streams that differ in colours alone share their
-    geometry.
+    Streams with equal render perturbations share a scene and its clean frames. A stream is rejected, with a reason, if
+    the first frame of its scene is rejected (``FirstFrame``). Streams that differ only in colours share their geometry.
     """
     renderer = opened.renderer(trajectory.model_xml)
     instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
@@ -45,7 +45,8 @@ def render(
     rejected: dict[str, str] = {}
     for changes, scene in grouped((stream.changes, stream) for stream in streams).items():
         with renderer.perturbed(changes):
-            if fault := first_frame.fault(scene):
+            fault = first_frame.fault(scene)
+            if fault:
                 rejected |= {stream.stream_id: fault for stream in scene}
                 continue
             for step in steps:
@@ -70,16 +71,16 @@ def render(
 def frames_of(
     renderer: Renderer, state: Floats, site_alpha: NDArray[np.float32], streams: Sequence[Stream], step: int
 ) -> list[Frame]:
-    """One frame (H, W, 3) uint8 RGB for each stream, turned by 180 degrees as policies see it.
+    """Render one frame (H, W, 3) of uint8 RGB for each stream, turned by 180 degrees as policies see it.
 
-    A view is rendered once: streams that differ in noise alone share its clean frame. Whoever renders many steps keeps
-    the scene perturbed meanwhile (``Renderer.perturbed``).
+    Each view is rendered once: streams that differ only in noise share its clean frame. To render many steps, keep the
+    scene perturbed over all of them (``Renderer.perturbed``).
 
     Args:
-        renderer: of the scene.
+        renderer: the scene's renderer.
         state, site_alpha: (S,) and (nsite,) as ``Renderer.restore`` takes them.
-        streams: one at least, all with the same render perturbations.
-        step: of the episode; random noise depends on it.
+        streams: at least one stream, all with equal render perturbations.
+        step: the episode's step; random noise depends on it.
     """
     with renderer.perturbed(streams[0].changes):
         renderer.restore(state, site_alpha)
@@ -89,6 +90,7 @@ def frames_of(
 
 
 def _noisy(frame: Frame, stream: Stream, step: int) -> Frame:
+    """Apply the stream's pixel perturbations of its view to a raw frame."""
     for noise in of_layer(stream.perturbations, PixelPerturbation):
         if stream.view in noise.views:
             frame = noise.apply(frame, step)

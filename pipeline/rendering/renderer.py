@@ -1,4 +1,4 @@
-"""One scene: put into stored states, perturbed, and rendered; the last one stays open for the next piece of work."""
+"""Renderer of one scene in stored states, with perturbations; the last scene stays open for the next piece of work."""
 
 import atexit
 import copy
@@ -18,11 +18,11 @@ from pipeline.types import Frame, State
 
 
 class Renderer:
-    """Renders one scene; close it before the next is made.
+    """Renderer of one scene; close it before you create the next renderer.
 
     Args:
-        scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
-        drawing: renders the model already; by default one is made.
+        scene: the scene's MJCF, or a compiled model, which then belongs to the renderer.
+        drawing: an open drawing of the model; by default a new drawing.
 
     Attributes:
         site_alpha: (nsite,) the sites' opacity in the first state.
@@ -42,15 +42,15 @@ class Renderer:
         mujoco.mj_forward(self.model, self.data)
 
     def frame(self, camera: str) -> Frame:
-        """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
+        """Render a frame (H, W, 3) of uint8 RGB of the restored state, oriented like LIBERO's raw observations."""
         return self.drawing.frame(self.data, camera)
 
     def surfaces(self, camera: str) -> Surfaces:
-        """What each pixel of :meth:`frame` shows of the restored state."""
+        """Render the depth, and the geom or site, of each pixel of :meth:`frame` in the restored state."""
         return self.drawing.surfaces(self.data, camera)
 
     def geoms(self, camera: str) -> NDArray[np.int32]:
-        """(H, W) the geom that each pixel of :meth:`frame` shows, by its number in the model; -1 for none."""
+        """Return for each pixel of :meth:`frame`, (H, W), its geom's number in the model; -1 without a geom."""
         _, number, kind = self.surfaces(camera)
         return np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, number, -1)
 
@@ -58,21 +58,25 @@ class Renderer:
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
         """Apply render-layer perturbations to the model, and undo them at the end.
 
-        Entered again inside itself with the same perturbations, it does nothing.
+        If these perturbations are applied already, by an outer call, do nothing.
         """
         if tuple(perturbations) == self._perturbations:
             yield
             return
         outer = self._perturbations
-        fields = {name for perturbation in perturbations for name in perturbation.fields}
+        fields: set[str] = set()
+        for perturbation in perturbations:
+            fields.update(perturbation.fields)
         former = {name: getattr(self.model, name).copy() for name in fields}
         textures: list[int] = []
         try:
             for perturbation in perturbations:
                 perturbation.apply(self.model)
             if "tex_data" in former:
-                pairs = zip(texels(self.model), texels(self.model, former["tex_data"]), strict=True)
-                textures = [number for number, (now, then) in enumerate(pairs) if not np.array_equal(now, then)]
+                texel_pairs = zip(texels(self.model), texels(self.model, former["tex_data"]), strict=True)
+                for texture, (perturbed, unperturbed) in enumerate(texel_pairs):
+                    if not np.array_equal(perturbed, unperturbed):
+                        textures.append(texture)
             self.drawing.load(textures)
             self._perturbations = tuple(perturbations)
             yield
@@ -87,10 +91,10 @@ class Renderer:
 
 
 class LastScene:
-    """Holds one open renderer at a time.
+    """Holder of the open renderer; at most one renderer is open at a time.
 
-    The next request for the same scene gets the same renderer. A request for another scene gets a new one, which takes
-    over the drawing and its OpenGL context if the drawing can ``adopt`` the scene.
+    Repeated requests for a scene return its renderer. A request for another scene returns a new renderer. It takes over
+    the drawing and its OpenGL context if the drawing can ``adopt`` the scene.
     """
 
     def __init__(self) -> None:
@@ -98,22 +102,25 @@ class LastScene:
         self._scene: str | mujoco.MjModel | None = None
 
     def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
-        """The renderer of a scene, by its MJCF or by a compiled model, which must not change meanwhile.
+        """Return the renderer of a scene.
 
-        It is no longer to be used when another scene was asked for.
+        A request for another scene makes the returned renderer unusable.
+
+        Args:
+            scene: the scene's MJCF, or a compiled model, which must not change while its renderer is used.
 
         Raises:
-            PipelineError: when nothing renders on this machine.
-            ValueError: when MuJoCo refuses the scene or one of its images.
+            PipelineError: if this machine cannot render.
+            ValueError: if MuJoCo rejects the scene or one of its images.
         """
-        same = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
-        if self._renderer is not None and same:
+        is_open = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
+        if self._renderer is not None and is_open:
             return self._renderer
         model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         try:
             adopted = self._renderer is not None and self._renderer.drawing.adopt(model)
         except BaseException:
-            # It holds parts of both scenes now.
+            # The drawing may hold parts of both scenes now.
             self.close()
             raise
         if self._renderer is not None and adopted:
@@ -135,5 +142,5 @@ class LastScene:
 
 @functools.cache
 def scene_of_process() -> LastScene:
-    """The one of this process, open from one piece of work to the next; whoever has no more work closes it."""
+    """Return this process's ``LastScene``, which stays open between pieces of work; close it after the last one."""
     return LastScene()

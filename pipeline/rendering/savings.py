@@ -1,8 +1,8 @@
-"""Chooses how a scene is rendered: plainly, or with savings that give the same pixels for less work.
+"""Choice between plain rendering and savings, which are optimizations of software rendering with equal pixels.
 
-Savings are used with the MuJoCo version and the device that they were tested with, if a small scene rendered both ways
-has equal pixels (0.6 s for each process). Otherwise, and on request, a scene is rendered plainly, which takes several
-times as long without a GPU.
+Savings are used with the MuJoCo version and the device with which they were tested. Each process first renders a small
+scene both ways (0.6 s) and uses savings only if all pixels are equal. Otherwise, and on request, scenes are rendered
+plainly. Without a GPU, plain rendering takes several times as long.
 """
 
 import functools
@@ -26,14 +26,17 @@ MUJOCO = "3.2.7"
 """The version of MuJoCo whose internals ``software/mujoco_3_2_7/`` relies on."""
 
 DEVICE = "llvmpipe"
-"""How the names of tested devices begin: Mesa's renderer without a GPU."""
+"""Prefix of the names of tested devices: Mesa's renderer without a GPU."""
 
 STATES = 4
-"""Poses of what moves, without and then with shadows. What stands still in two of them is an underlay."""
+"""Poses of the moving body, without and then with shadows. Geoms that stand still in two poses join an underlay."""
 
 ANGLES, HEIGHTS = 2.4 * np.arange(400), np.linspace(-0.99, 0.99, 400)
-BALL = np.column_stack([np.sqrt(1 - HEIGHTS**2) * wave(ANGLES) for wave in (np.cos, np.sin)] + [HEIGHTS])
+RADII = np.sqrt(1 - HEIGHTS**2)
+BALL = np.column_stack([RADII * np.cos(ANGLES), RADII * np.sin(ANGLES), HEIGHTS])
 """(400, 3) vertices of a mesh of 796 faces: more than llvmpipe renders at once."""
+
+_VERTICES = " ".join(f"{coordinate:.4f}" for coordinate in BALL.ravel())
 
 SCENE = f"""
 <mujoco>
@@ -44,7 +47,7 @@ SCENE = f"""
     <material name="squares" texture="squares" texrepeat="3 2" specular="0.6"/>
     <material name="cube" texture="cube"/>
     <material name="mirror" reflectance="0.4"/>
-    <mesh name="ball" vertex="{" ".join(f"{x:.4f}" for x in BALL.ravel())}" scale="0.2 0.2 0.15"/>
+    <mesh name="ball" vertex="{_VERTICES}" scale="0.2 0.2 0.15"/>
   </asset>
   <worldbody>
     <light pos="0.3 0.2 2" dir="0 -0.1 -1" castshadow="false"/>
@@ -62,7 +65,7 @@ SCENE = f"""
 
 
 def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
-    """A drawing of a model, with savings where they can be used."""
+    """Create a drawing of a model, with savings if they can be used."""
     if why_plain() is None:
         from pipeline.rendering.software.drawing import SoftwareDrawing
 
@@ -74,7 +77,10 @@ def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
 
 @functools.cache
 def why_plain() -> str | None:
-    """The reason why this process renders plainly, logged where it could be quicker; None when it uses savings."""
+    """Return the reason why this process renders plainly; ``None`` if it uses savings.
+
+    Log the reason if savings would make rendering faster.
+    """
     if os.environ.get(PLAIN):
         return f"{PLAIN} is set"
     device = gl.choose().device
@@ -86,35 +92,38 @@ def why_plain() -> str | None:
         reason = f"savings were tested with {DEVICE}, this is {device}"
     elif importlib.util.find_spec("pipeline.rendering.software") is None:
         reason = "this installation has no savings"
-    elif found := fault():
-        reason = f"on {device} {found}"
     else:
-        return None
+        difference = fault()
+        if difference is None:
+            return None
+        reason = f"on {device} {difference}"
     _say(reason)
     return reason
 
 
 @functools.cache
 def _say(reason: str) -> None:
-    logging.getLogger(__name__).warning("rendered by MuJoCo as it is: %s", reason)
+    """Log that scenes are rendered plainly, once a process for each reason."""
+    logging.getLogger(__name__).warning("software-rendering optimizations are disabled: %s", reason)
 
 
 def fault() -> str | None:
-    """What is wrong with savings here; None when all pixels are equal."""
+    """Return the error or the difference that savings cause here; ``None`` if all pixels are equal."""
     from pipeline.rendering.software.drawing import SoftwareDrawing
 
     try:
         plain, saving = frames(PlainDrawing), frames(SoftwareDrawing)
     except PipelineError as error:
-        return f"OpenGL does not do what they ask: {error.what}"
-    wrong = sum(not np.array_equal(one, other) for one, other in zip(plain, saving, strict=True))
-    return f"{wrong} of {len(plain)} frames of a small scene have other pixels" if wrong else None
+        return f"OpenGL rejects a command of the savings: {error.what}"
+    frame_pairs = zip(plain, saving, strict=True)
+    differing = sum(not np.array_equal(plain_frame, saving_frame) for plain_frame, saving_frame in frame_pairs)
+    return f"{differing} of {len(plain)} frames of a small scene have other pixels" if differing else None
 
 
 def frames(kind: type[PlainDrawing]) -> list[Frame]:
-    """The scene in all states, rendered in one way."""
+    """Render the small scene in all states by one kind of drawing."""
     model = mujoco.MjModel.from_xml_string(SCENE)
-    data, shown = mujoco.MjData(model), []
+    data, rendered = mujoco.MjData(model), []
     with closing(kind(model)) as drawing:
         for shadows in (0, 1):
             model.light_castshadow[1] = shadows
@@ -122,5 +131,5 @@ def frames(kind: type[PlainDrawing]) -> list[Frame]:
                 data.mocap_pos[0, 1] = 0.1 * state
                 data.mocap_quat[0] = np.cos(state), np.sin(state), 0, 0
                 mujoco.mj_forward(model, data)
-                shown.append(drawing.frame(data, "eye"))
-    return shown
+                rendered.append(drawing.frame(data, "eye"))
+    return rendered

@@ -1,4 +1,4 @@
-"""Whether the first frame of a perturbed scene shows enough: the task's things, the hand, and added objects."""
+"""Visibility check of a perturbed scene's first frame: the task's things, the hand, and added objects."""
 
 from __future__ import annotations
 
@@ -20,24 +20,27 @@ from pipeline.types import Floats, Task, Trajectory
 CAMERA = "agentview"
 
 LEAST_PX = 20
-"""Pixels of each thing that must show in the first frame, of 256 x 256."""
+"""Least number of pixels of each thing in the first frame of 256 x 256."""
 
 MOST_OUTSIDE = 0.25
-"""Share of the steps that the hand may be outside of the frame, where another axis than the camera changed the view."""
+"""Largest share of the steps with the hand outside of the frame, if an axis other than the camera changed the view."""
 
 TESTED_OUTSIDE: dict[Component, float] = {"distance": 0.62, "spherical": 0.58, "orientation": 0.63}
-"""The same under the camera axis, by component: the largest share of LIBERO-Plus's 1,599 test cameras, each over the
-starter demonstration of its task (``benchmarks/test_cameras_seen.py``, rounded up). What a test shows, training may."""
+"""Largest share of the steps with the hand outside of the frame under the camera axis, by component.
+
+It is the largest share of LIBERO-Plus's 1,599 test cameras, rounded up: training may show any view that a test shows.
+Each camera is measured over the starter demonstration of its task (``benchmarks/test_cameras_seen.py``).
+"""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What is seen from one camera.
+    """Visible things in one camera's view.
 
     Attributes:
         things_px: thing to the number of pixels that show it in the restored state.
         hand_outside: share of an episode's steps at which the hand is outside of the frame.
-        added_px: the same as ``things_px`` for each object that the layout axis added.
+        added_px: number of pixels of each object that the layout axis added, in the restored state.
     """
 
     things_px: dict[str, int]
@@ -46,9 +49,12 @@ class Sight:
 
     @classmethod
     def of(cls, renderer: Renderer, task: Task, hand_m: Floats) -> Sight:
-        """What the agent view sees in the restored state, of what LIBERO lists as of interest in the task.
+        """Measure the restored state in the agent view, for the things that LIBERO lists as of interest in the task.
 
-        ``hand_m`` (T, 3) is where the grip site is at each step, in the world.
+        Args:
+            renderer: the scene's renderer, with a restored state.
+            task: the task.
+            hand_m: (T, 3) position of the grip site at each step, in the world.
         """
         model, data = renderer.model, renderer.data
         seen = renderer.geoms(CAMERA)
@@ -58,20 +64,22 @@ class Sight:
         things = bddl.read(task.bddl_file).things_of_interest
         # A camera looks along its -z axis.
         x, y, z = ((hand_m - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)).T
-        reach = -z * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
+        half_width = -z * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
+        hand_outside = (np.abs(x) > half_width) | (np.abs(y) > half_width)
         return cls(
             {thing: int(trees[model.body(f"{thing}_main").rootid[0]]) for thing in things},
-            float(np.mean((np.abs(x) > reach) | (np.abs(y) > reach))),
+            float(np.mean(hand_outside)),
             tuple(int(trees[model.body(name).rootid[0]]) for name in added_objects(model)),
         )
 
     def faults(self, original: Sight, most_outside: float = MOST_OUTSIDE) -> list[str]:
-        """Names of what a camera shows too little of; empty when it shows enough.
+        """Return the names of the faults of this sight; the list is empty if the camera shows enough.
 
-        Of the task's things and the hand, no more is asked than the scene's own camera shows.
+        The task's things and the hand need not be more visible than in the original scene.
 
         Args:
-            most_outside: share of the steps that the hand may be outside of the frame.
+            original: the sight of the original scene.
+            most_outside: largest share of the steps with the hand outside of the frame.
         """
         least_px = {thing: min(LEAST_PX, px) for thing, px in original.things_px.items()}
         faults = {
@@ -83,10 +91,10 @@ class Sight:
 
 
 class FirstFrame:
-    """Judges perturbed scenes of a trajectory by its first frame; the renderer is not perturbed at first.
+    """Judge of perturbed scenes of a trajectory by their first frame.
 
-    A perturbed scene is refused when a frame is black or blown out (``exposure``), or when the agent view shows too
-    little (``Sight``).
+    A perturbed scene is rejected if a frame is black or blown out (``exposure``), or if the agent view shows too little
+    (``Sight``). Create the judge while the renderer is not perturbed.
     """
 
     def __init__(self, renderer: Renderer, trajectory: Trajectory, task: Task, hand_m: Floats):
@@ -96,13 +104,16 @@ class FirstFrame:
         self._original = Sight.of(renderer, task, hand_m)
 
     def fault(self, streams: Sequence[Stream]) -> str | None:
-        """What is wrong with the streams' scene, which the renderer shows now; None when nothing is."""
+        """Return the first fault of the streams' scene, which the renderer shows now; ``None`` without a fault."""
         self._renderer.restore(*self._first)
         changes = streams[0].changes
         faults: list[str] = []
         cameras = dict.fromkeys(SCHEMA.views[stream.view].camera for stream in streams)
         if changes:
-            faults += [fault for camera in cameras if (fault := exposure(self._renderer.frame(camera)))]
+            for camera in cameras:
+                exposure_fault = exposure(self._renderer.frame(camera))
+                if exposure_fault:
+                    faults.append(exposure_fault)
         if CAMERA in cameras:
             moved = any(change.sees_otherwise for change in changes)
             sight = Sight.of(self._renderer, self._task, self._hand_m) if moved else self._original
@@ -111,6 +122,6 @@ class FirstFrame:
 
 
 def _most_outside(changes: Sequence[RenderPerturbation]) -> float:
-    """Share of the steps that the hand may be outside of the frame under these changes."""
+    """Return the largest share of the steps with the hand outside of the frame under these changes."""
     cameras = [change.component for change in changes if isinstance(change, CameraPerturbation)]
     return max((TESTED_OUTSIDE[component] for component in cameras), default=MOST_OUTSIDE)

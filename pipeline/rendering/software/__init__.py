@@ -1,1 +1,1 @@
-"""Savings of software rendering: the same pixels with less work for Mesa."""
+"""Savings of software rendering: equal pixels with less work for Mesa."""

@@ -1,9 +1,9 @@
-"""Renders the pixels of ``PlainDrawing`` with less work for Mesa, and one scene after the other in one context.
+"""Rendering of the pixels of ``PlainDrawing`` with less work for Mesa, and of successive scenes in one context.
 
 * Geoms outside of the view are not rendered (``culling.py``).
-* Of large meshes, only faces that cover a sample are rendered (``skins.py``, ``samples.py``).
-* What stands still before a camera is rendered once, and its colour and depth are kept as an underlay (``Still``).
-* Meshes and textures that a scene shares with the one before stay in the context.
+* Large meshes are rendered only by their faces that cover a sample (``skins.py``, ``samples.py``).
+* Geoms that stand still before a camera are rendered once; their colour and depth are kept as an underlay (``Still``).
+* Meshes and textures that a scene shares with the previous scene stay in the context.
 """
 
 from collections.abc import Collection
@@ -27,17 +27,17 @@ from pipeline.rendering.software.skins import SkinnedMeshes
 from pipeline.types import Frame
 
 LOOK = tuple(name for name in FIELDS if name != "tex_data")
-"""Arrays of a model that perturbations may change and a picture depends on, beside textures."""
+"""Arrays of a model, without textures, that perturbations may change and on which a picture depends."""
 
 CULLED = mujoco.mjNGROUP - 1
 """A group of geoms and sites that LIBERO does not use and that is never rendered."""
 
 LONGEST_WAIT = 16
-"""Pictures that a geom must stand still, at most, before it joins the underlay."""
+"""Largest number of pictures for which a geom must stand still before it joins the underlay."""
 
 
 class Shot(NamedTuple):
-    """A picture to render: the state, the camera, and what has to be rendered."""
+    """Picture to render: the state, the camera, and the geoms, lights and sites to render."""
 
     data: mujoco.MjData
     camera: str
@@ -45,11 +45,12 @@ class Shot(NamedTuple):
 
 
 class Still:
-    """Chooses the geoms of one camera's underlay.
+    """Choice of the geoms of one camera's underlay.
 
-    An underlay has to be rendered anew when one of its geoms moves, and an object at rest moves by a millionth now and
-    then. So each time a geom leaves the underlay, it has to stand still for twice as many pictures to join again. Geoms
-    join once rendering them beside the underlay has cost more faces than a new underlay would have.
+    An underlay has to be rendered again when one of its geoms moves, and an object at rest moves by a millionth now and
+    then. Each time a geom leaves the underlay, it therefore has to stand still for twice as many pictures to join
+    again. Geoms join once rendering them in addition to the underlay has cost more faces than a new underlay would
+    have.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -59,12 +60,12 @@ class Still:
         self._view = b""
 
     def geoms(self, view: bytes, places: NDArray[np.float32], rendered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(ngeom,) the geoms of the underlay for the next picture.
+        """Choose the geoms of the underlay for the next picture, a mask (ngeom,).
 
         Args:
-            view: what a picture depends on beside the geoms: the camera, and where the lamps are.
+            view: bytes of the camera, the lamps and all other data on which a picture depends, without the geoms.
             places: (ngeom, 12) positions and rotations of the geoms, as they are rendered.
-            rendered: (ngeom,) which geoms are to be rendered.
+            rendered: (ngeom,) geoms that are to be rendered.
         """
         if view != self._view:
             self._view, self._places = view, places
@@ -72,27 +73,27 @@ class Still:
             self._age: NDArray[np.intp] = np.zeros(len(places), np.intp)
             self._beside = 0
             return self._geoms
-        stood = (places == self._places).all(axis=1)
+        stood_still = (places == self._places).all(axis=1)
         self._places = places
-        left = self._geoms & ~stood
-        self._wait[left] = np.minimum(2 * self._wait[left], LONGEST_WAIT)
-        self._age = np.where(stood, self._age + 1, 0)
+        leaving = self._geoms & ~stood_still
+        self._wait[leaving] = np.minimum(2 * self._wait[leaving], LONGEST_WAIT)
+        self._age = np.where(stood_still, self._age + 1, 0)
         ready = rendered & (self._age >= self._wait)
         self._beside += int(self._faces[ready & ~self._geoms].sum())
-        if left.any() or self._beside > self._faces[ready].sum():
+        if leaving.any() or self._beside > self._faces[ready].sum():
             self._geoms, self._beside = ready, 0
         return self._geoms
 
 
 class SoftwareDrawing(PlainDrawing):
-    """Renders models that are ``possible``.
+    """Drawing of models that are ``possible``, with all savings.
 
     Raises:
-        PipelineError: when OpenGL does not do what is asked of it.
+        PipelineError: if OpenGL reports an error.
     """
 
     def __init__(self, model: mujoco.MjModel):
-        # The context is made for what all scenes have in common, and then goes on with this model.
+        # Create the context for the common parts of all scenes, and then switch it to this model.
         bare = private.bare(model)
         super().__init__(bare)
         with ExitStack() as undo:
@@ -107,11 +108,16 @@ class SoftwareDrawing(PlainDrawing):
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
-        """Whether a model has nothing that needs a context of its own. LIBERO's models have no such thing."""
+        """Return whether this drawing can render a model, which must not need its own context.
+
+        A model needs its own context for height fields, skins, planes without bounds, or a number of samples other than
+        ``SAMPLES``. LIBERO's models have none of these.
+        """
         bounded = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] > 0
         return not model.nhfield and not model.nskin and bool(bounded.all()) and model.vis.quality.offsamples == SAMPLES
 
     def adopt(self, model: mujoco.MjModel) -> bool:
+        """Switch to another model in this context if possible, and return whether it was."""
         if not self.possible(model) or private.fixed(model) != private.fixed(self._model):
             return False
         self._gl.make_current()
@@ -119,6 +125,7 @@ class SoftwareDrawing(PlainDrawing):
         return True
 
     def _show(self, model: mujoco.MjModel) -> None:
+        """Replace the former model in the context; meshes and textures of both models stay."""
         private.adopt_textures(self._context, model, self._model)
         private.adopt_size(self._context, model)
         self._model = model
@@ -130,16 +137,19 @@ class SoftwareDrawing(PlainDrawing):
         self._forget_underlays()
 
     def load(self, textures: Collection[int]) -> None:
+        """Upload these textures from the model's ``tex_data``, and forget all underlays, which show the old ones."""
         super().load(textures)
         if textures:
             self._forget_underlays()
 
     def _forget_underlays(self) -> None:
+        """Mark all underlays as out of date."""
         self._still.clear()
         for underlay in self._underlays.values():
             underlay.content = b""
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:
+        """Render a frame like ``PlainDrawing.frame``, with savings."""
         self._gl.make_current()
         shot = Shot(data, camera, self._culling.picture(data, camera))
         if shot.picture.underlaid:
@@ -151,8 +161,8 @@ class SoftwareDrawing(PlainDrawing):
     def _draw_over_still(self, shot: Shot) -> None:
         """Render a picture over an underlay of the geoms that stand still."""
         camera, opaque = shot.camera, shot.picture.opaque & ~shot.picture.mirror
-        view, places = self._view(shot), np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1)
-        places = places.astype(np.float32)
+        view = self._view(shot)
+        places = np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1).astype(np.float32)
         if camera not in self._still:
             self._still[camera] = Still(self._model)
         still = self._still[camera].geoms(view, places, opaque) & opaque
@@ -167,10 +177,13 @@ class SoftwareDrawing(PlainDrawing):
         self._draw(shot, opaque & ~still, underlay)
 
     def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
-        """Render opaque geoms (ngeom,) of a picture over an underlay.
+        """Render opaque geoms of a picture over an underlay.
 
         Args:
-            last: whether this completes the picture, with what is in no underlay: mirror, transparent geoms, sites,
+            shot: the picture.
+            opaque: (ngeom,) the geoms.
+            underlay: the underlay, or ``None``.
+            last: True completes the picture with all parts that no underlay has: mirror, transparent geoms, sites,
                 shadows and sky.
         """
         model, picture, flags = self._model, shot.picture, self._scene.flags
@@ -179,7 +192,7 @@ class SoftwareDrawing(PlainDrawing):
             rendered = opaque | picture.mirror | picture.clear
             passes = [Pass(Purpose.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear)]
             if picture.mirror.any():
-                # A geom that is there for its image alone is not rendered before the camera.
+                # Geoms that show only in the mirror are rendered in the mirror's pass, not in the camera's.
                 rendered = rendered | picture.images
                 passes.insert(0, Pass(Purpose.MIRROR, picture.images | picture.clear))
             for lamp in picture.lamps:
@@ -194,7 +207,8 @@ class SoftwareDrawing(PlainDrawing):
             super()._update(shot.data, shot.camera)
             skinned = None
             if picture.projection is not None:
-                wanted = np.logical_or.reduce([each.geoms for each in passes if each.purpose.by_camera])
+                camera_passes = [single_pass for single_pass in passes if single_pass.purpose.by_camera]
+                wanted = np.logical_or.reduce([single_pass.geoms for single_pass in camera_passes])
                 skinned = self._skinned.put(self._scene, shot.data, picture.projection, wanted)
             self._meshes.show((shot.camera, last), passes, self._scene, skinned, underlay)
             self._render()
@@ -204,13 +218,13 @@ class SoftwareDrawing(PlainDrawing):
             flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
 
     def _update(self, data: mujoco.MjData, camera: str) -> None:
-        """Include everything, as surfaces need."""
+        """Update the scene with everything in it, for ``surfaces``."""
         super()._update(data, camera)
         everything = Pass(Purpose.CAMERA, np.ones(self._model.ngeom, np.bool_))
         self._meshes.show("everything", [everything], self._scene)
 
     def _view(self, shot: Shot) -> bytes:
-        """The bytes of all that a picture depends on beside textures, geoms and sites."""
+        """Return the bytes of all data on which a picture depends, without textures, geoms and sites."""
         data, number = shot.data, self._model.camera(shot.camera).id
         fields = [getattr(self._model, name) for name in LOOK]
         fields += [data.cam_xpos[number], data.cam_xmat[number], data.light_xpos, data.light_xdir]

@@ -1,8 +1,8 @@
-"""Which faces of a mesh cover a sample of the picture; the others change no pixel.
+"""Choice of the faces of a mesh that cover a sample of the picture; all other faces change no pixel.
 
-A picture has four samples a pixel (multisampling), and most faces of LIBERO's meshes lie between samples: of 90,000
-faces of the arm in an agent view, 17,000 cover a sample and face the camera. MuJoCo passes all of them to OpenGL, which
-tests each one.
+A picture has four samples a pixel (multisampling), and most faces of LIBERO's meshes lie between samples. In an agent
+view, the arm has 90,000 faces, of which 17,000 cover a sample and face the camera. MuJoCo passes all faces to OpenGL,
+which tests each face.
 """
 
 from __future__ import annotations
@@ -17,21 +17,27 @@ from pipeline.rendering.software.faces import Faces
 from pipeline.types import Floats
 
 BATCH_FACES = 341
-"""llvmpipe processes so many faces of a display list or an index buffer at once. If one of them has a corner outside of
-the view, it tests which side of each face is seen before it rounds the corners, else afterwards."""
+"""Number of faces of a display list or an index buffer that llvmpipe processes at once, as a batch.
+
+llvmpipe tests which side of each face is seen. If a face of the batch has a corner outside of the view, this test comes
+before the corners are rounded, else afterwards.
+"""
 
 MARGIN_PX = 1 / 128
-"""How far beside a face a sample counts as covered. OpenGL rounds corners to 1/256 of a pixel, so by half of that."""
+"""Distance from a face within which a sample counts as covered.
+
+OpenGL rounds corners to 1/256 of a pixel, so a corner moves by up to half of that.
+"""
 
 SAMPLES = 4
-"""Of a pixel, as LIBERO's scenes ask for."""
+"""Number of samples of a pixel, which LIBERO's scenes request."""
 
 
 class Projection(NamedTuple):
-    """How a picture shows places of some frame of reference, at first the world's.
+    """Projection of places in a frame of reference, first the world's, to a picture.
 
     Attributes:
-        matrix: (3, 4) of a place, in m, to its column, its row from below, and 1, all times its depth.
+        matrix: (3, 4) maps a place, in m, to its column, its row from below, and 1, all times its depth.
         near_m, far_m: depths before and beyond which nothing is rendered.
         size_px: width and height.
     """
@@ -42,7 +48,7 @@ class Projection(NamedTuple):
     size_px: tuple[int, int]
 
     def from_frame(self, position_m: Floats, rotation: Floats) -> Projection:
-        """The same of places in a frame that stands at a position (3,) with a rotation (9,)."""
+        """Return this projection for places in another frame, which has a position (3,) and a rotation (9,)."""
         matrix = np.empty((3, 4))
         matrix[:, :3] = self.matrix[:, :3] @ rotation.reshape(3, 3)
         matrix[:, 3] = self.matrix[:, :3] @ position_m + self.matrix[:, 3]
@@ -50,27 +56,30 @@ class Projection(NamedTuple):
 
 
 def room(faces: int) -> int:
-    """How many numbers ``faces_that_show`` writes at most for a mesh of so many faces: of all of them, of as many that
-    fill batches before others of the mesh, and of one corner outside in each."""
+    """Return the largest number of corners that ``faces_that_show`` writes for a mesh of ``faces`` faces.
+
+    It writes all faces, as many faces again that fill batches, and in each batch a face that brings in a corner outside
+    of the view.
+    """
     return 3 * (2 * faces + 2 * (2 * faces // BATCH_FACES + 2) + BATCH_FACES)
 
 
 def faces_that_show(
     projection: Projection, faces: Faces, samples: NDArray[np.float32], found: NDArray[np.uint32]
 ) -> int:
-    """Write the corners of all faces that may cover a sample, in their order, and between them some without an area.
+    """Write the corners of all faces that may cover a sample, in their order, with some faces without area between.
 
-    Two loops without branches leave out faces one after the other. With branches, most of the time would go into
-    those that the processor predicts wrongly.
+    Two loops without branches leave out faces in turn. With branches, wrong predictions by the processor would take
+    most of the time.
 
     Args:
-        projection: of the picture, from the frame of the mesh.
-        faces: of the mesh; their corners come counter-clockwise as seen from the front.
+        projection: the picture's projection from the frame of the mesh.
+        faces: the mesh's faces; their corners are counter-clockwise as seen from the front.
         samples: (``SAMPLES``, 2) place of each sample in its pixel, 0 to 1 to the right and up.
-        found: (``room(F)``,) to write into.
+        found: (``room(F)``,) output array.
 
     Returns:
-        How many numbers were written.
+        The number of corners written.
     """
     matrix, near_m, far_m, size_px = projection
     corners = faces.place_of_corner
@@ -82,15 +91,17 @@ def faces_that_show(
     )
 
 
-# The loops that Numba compiles take arrays and numbers one by one: it compiles no records of ours.
+# Numba does not compile the pipeline's records, so the compiled loops take arrays and numbers as single arguments.
 
 
 @compiled
 def _projected(
     matrix: Floats, near_m: float, far_m: float, places_m: NDArray[np.float32], width_px: int, height_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """(P, 2) column and row of places (P, 3), NaN near the near plane and before it, and (P,) which are outside of the
-    view.
+    """Project places (P, 3) to the picture.
+
+    Returns:
+        (P, 2) columns and rows, NaN near the near plane and before it; and a mask (P,) of places outside of the view.
     """
     at_px, outside = np.empty((len(places_m), 2), np.float32), np.empty(len(places_m), np.bool_)
     for place in range(len(places_m)):
@@ -110,11 +121,11 @@ def _projected(
 def _facing(
     at_px: NDArray[np.float32], outside: NDArray[np.bool_], place_of_corner: NDArray[np.uint32], batch_faces: int
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """The faces (L,) that may face the camera.
+    """Find the faces (L,) that may face the camera.
 
     Returns:
-        Their numbers; of each, whether it may be turned away as well; and whether OpenGL sorts its batch by front and
-        back before corners are rounded.
+        Their numbers (L,); a mask (L,) of faces that may also be turned away; and a mask (L,) of faces whose batch
+        OpenGL sorts by front and back before it rounds corners.
     """
     left_over, doubtful = np.empty(len(place_of_corner), np.int32), np.empty(len(place_of_corner), np.bool_)
     before = np.empty(len(place_of_corner), np.bool_)
@@ -130,7 +141,7 @@ def _facing(
             cax, cay = at_px[a, 0] - at_px[c, 0], at_px[a, 1] - at_px[c, 1]
             cbx, cby = at_px[b, 0] - at_px[c, 0], at_px[b, 1] - at_px[c, 1]
             twice_area = cax * cby - cay * cbx
-            # So near to 0 the face may turn around when its corners are rounded.
+            # If the area is closer to 0 than this, the face may turn around when its corners are rounded.
             unsure = margin * (abs(cax) + abs(cay) + abs(cbx) + abs(cby) + margin)
             left_over[count], doubtful[count] = face, not twice_area > unsure
             before[count] = sorted_before
@@ -151,9 +162,11 @@ def _covering(
 ) -> tuple[int, NDArray[np.bool_]]:
     """Keep the faces that may cover a sample of the picture.
 
+    The last three arguments are the results of ``_facing``. The kept faces are written to the front of ``left_over``
+    and ``before``.
+
     Returns:
-        How many are kept, written to the front of the last three arrays, which are those of ``_facing``; and of each,
-        whether it may face either way.
+        The number of kept faces; and a mask of the faces that may face either way.
     """
     either_way = np.empty(len(left_over), np.bool_)
     margin, count = np.float32(MARGIN_PX), 0
@@ -166,7 +179,7 @@ def _covering(
         inside = (right >= 0) & (left <= width_px) & (high >= 0) & (low <= height_px)
         wide = (right - left > 1) | (high - low > 1)
         abx, aby, bcx, bcy, cax, cay = bx - ax, by - ay, cx - bx, cy - by, ax - cx, ay - cy
-        # Of each side, how far a place is to its left, times the side's length.
+        # These are the constant terms of a place's distance to the left of each side, times the side's length.
         ab = margin * (abs(abx) + abs(aby)) - abx * ay + aby * ax
         bc = margin * (abs(bcx) + abs(bcy)) - bcx * by + bcy * bx
         ca = margin * (abs(cax) + abs(cay)) - cax * cy + cay * cx
@@ -179,7 +192,7 @@ def _covering(
         cut = ax + bx + cx
         unsure = margin * (abs(cax) + abs(cay) + abs(bcx) + abs(bcy) + margin)
         left_over[count], before[count] = face, before[number]
-        # To OpenGL, whose numbers have the same precision, it may face either way.
+        # OpenGL computes in the same precision, so it may see the face either way.
         either_way[count] = cay * bcx - cax * bcy <= unsure / 8
         count += (inside & (covers | wide | doubtful[number])) | (cut != cut)
     return count, either_way
@@ -196,8 +209,14 @@ def _in_batches(
     batch_faces: int,
     found: NDArray[np.uint32],
 ) -> int:
-    """Write faces so that in each batch that OpenGL makes of them, all that may face either way are sorted as in the
-    mesh: faces without an area fill a batch up, or bring in a corner outside of the view."""
+    """Write faces so that OpenGL sorts faces that may face either way as it sorts them in the whole mesh.
+
+    OpenGL divides the written faces into batches. Additional faces without area fill up a batch, or bring a corner
+    outside of the view into it.
+
+    Returns:
+        The number of corners written.
+    """
     written, met_outside, met_after = 0, False, False
     for number in range(len(faces)):
         face = faces[number]
@@ -206,7 +225,7 @@ def _in_batches(
         after = either_way[number] and not before[number]
         outsider = either_way[number] and before[number] and not reaches_out
         clash = (met_outside and after) or (met_after and (reaches_out or outsider))
-        # An outsider takes a place in the same batch.
+        # A face with an added corner outside of the view takes a second place in its batch.
         places_left = (batch_faces - written % batch_faces) % batch_faces
         fill = places_left if clash or (outsider and places_left == 1) else 0
         for _ in range(fill):

@@ -1,4 +1,4 @@
-"""Renders of large meshes only the faces that a picture can show, by an index buffer for each."""
+"""Rendering of large meshes by only the faces that a picture can show, with an index buffer for each mesh."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ LEAST_FACES = 256
 
 
 class SkinnedMeshes:
-    """Gives each geom of a large mesh a skin, which renders chosen faces of it.
+    """Assignment of skins to the geoms of large meshes; a skin renders chosen faces of its geom's mesh.
 
     Args:
+        skins: the context's skins.
         samples: (SAMPLES, 2) place of each sample in its pixel.
-        shown: (ngeom,) which geoms can be rendered.
-        former: those of the model that the context was for before.
+        meshes: the display lists of the model's meshes.
+        shown: (ngeom,) geoms that can be rendered.
+        former: the ``SkinnedMeshes`` of the context's former model; its faces are reused.
     """
 
     def __init__(
@@ -39,36 +41,44 @@ class SkinnedMeshes:
         self._skin: NDArray[np.intp] = np.full(model.ngeom, -1, np.intp)
         self._faces: dict[bytes, Faces] = {}
         self._faces_of_geom: dict[int, Faces] = {}
-        known = former._faces if former else {}
+        former_faces = former._faces if former else {}
         textured, plain = iter(range(SKINS)), iter(range(SKINS, 2 * SKINS))
         rendered = np.flatnonzero(shown & (self._mesh >= 0))
         for geom, mesh in zip(rendered.tolist(), self._mesh[rendered].tolist(), strict=True):
             if model.mesh_facenum[mesh] >= LEAST_FACES:
                 content = meshes.contents[mesh]
-                faces = self._faces.get(content) or known.get(content) or faces_of(model, mesh)
+                faces = self._faces.get(content) or former_faces.get(content) or faces_of(model, mesh)
                 self._faces[content] = self._faces_of_geom[geom] = faces
                 self._skin[geom] = next(plain if faces.texture is None else textured, -1)
                 if self._skin[geom] >= 0:
                     skins.fill_vertices(int(self._skin[geom]), faces, content)
-        # All geoms of a mesh are rendered in one way.
-        self._skin[np.isin(self._mesh, self._mesh[rendered[self._skin[rendered] < 0]])] = -1
+        # If one geom of a mesh has no skin, no geom of this mesh has a skin.
+        meshes_without_skin = self._mesh[rendered[self._skin[rendered] < 0]]
+        self._skin[np.isin(self._mesh, meshes_without_skin)] = -1
         most = max((room(len(faces.corners)) for faces in self._faces.values()), default=0)
         self._found: NDArray[np.uint32] = np.empty(most, np.uint32)
 
     def put(
         self, scene: mujoco.MjvScene, data: mujoco.MjData, projection: Projection, wanted: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Have the skins follow their meshes in a scene, with the faces that a picture can show of ``wanted`` geoms.
+        """Put the skins after their meshes into a scene, with the faces that a picture can show of ``wanted`` geoms.
+
+        Args:
+            scene: the updated scene.
+            data: the state.
+            projection: the picture's projection from the world.
+            wanted: (ngeom,) geoms to render in the camera's passes.
 
         Returns:
-            (nmesh,) which meshes have their skins in the scene.
+            A mask (nmesh,) of the meshes whose skins are in the scene.
         """
-        shown, of_mesh = self._skins.meshes_of_scene()
-        geoms = np.where(of_mesh, shown["objid"], 0)
+        scene_geoms, of_mesh = self._skins.meshes_of_scene()
+        geoms = np.where(of_mesh, scene_geoms["objid"], 0)
         skins = np.where(of_mesh, self._skin[geoms], -1)
-        # MuJoCo renders what can be seen through last, and in an order of its own.
-        skins[np.isin(self._mesh[geoms], self._mesh[geoms[of_mesh & (shown["rgba"][:, 3] < OPAQUE)]])] = -1
-        if len(shown) + 2 * np.count_nonzero(skins >= 0) >= scene.maxgeom:
+        # MuJoCo renders transparent geoms last, and in a different order.
+        transparent_meshes = self._mesh[geoms[of_mesh & (scene_geoms["rgba"][:, 3] < OPAQUE)]]
+        skins[np.isin(self._mesh[geoms], transparent_meshes)] = -1
+        if len(scene_geoms) + 2 * np.count_nonzero(skins >= 0) >= scene.maxgeom:
             skins[:] = -1
         for geom in geoms[skins >= 0].tolist():
             count = 0
@@ -76,8 +86,8 @@ class SkinnedMeshes:
                 of_geom = projection.from_frame(data.geom_xpos[geom], data.geom_xmat[geom])
                 count = faces_that_show(of_geom, self._faces_of_geom[geom], self._samples, self._found)
             self._skins.fill_faces(int(self._skin[geom]), self._found[:count])
-        having = self._mesh[geoms[skins >= 0]]
-        self._skins.follow(shown, skins, self._meshes.closing[having])
+        meshes_with_skin = self._mesh[geoms[skins >= 0]]
+        self._skins.follow(scene_geoms, skins, self._meshes.closing[meshes_with_skin])
         skinned = np.zeros(len(self._meshes.closing), np.bool_)
-        skinned[having] = True
+        skinned[meshes_with_skin] = True
         return skinned

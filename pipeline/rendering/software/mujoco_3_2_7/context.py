@@ -1,4 +1,4 @@
-"""A context of MuJoCo 3.2.7 that goes on from one model to the next, with the textures that both have."""
+"""A context of MuJoCo 3.2.7 that switches from one model to the next and keeps the textures of both."""
 
 from operator import attrgetter
 
@@ -10,7 +10,7 @@ from pipeline.rendering.drawing import texels
 from pipeline.rendering.opengl import calls, check
 
 SKINS = 64
-"""As many with places in a texture, and as many without; LIBERO's scenes have up to 50 large meshes."""
+"""Number of skins with texture coordinates, and of skins without; LIBERO's scenes have up to 50 large meshes."""
 
 _TEXTURE = ' texcoord="0 0 0 0 0 0"'
 _SKIN = (
@@ -21,39 +21,40 @@ _FIXED = (
     *("global_.offwidth", "global_.offheight", "global_.linewidth", "rgba.fog"),
     *("quality.offsamples", "quality.shadowsize", "quality.numslices", "quality.numstacks", "quality.numquads"),
 )
-"""Settings of ``mjVisual`` that a context keeps as they were when it was made."""
+"""Settings of ``mjVisual`` that a context keeps from its creation."""
 
 
 def bare(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A model with nothing but another model's planes and settings, and ``SKINS`` skins of both kinds."""
+    """Create a model with only another model's planes and settings, and ``SKINS`` skins of both kinds."""
     planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-    made = mujoco.MjModel.from_xml_string(
+    bare_model = mujoco.MjModel.from_xml_string(
         f"""<mujoco><worldbody>{'<geom type="plane" size="1 1 1"/>' * len(planes)}<body name="bone"/></worldbody>
         <deformable>{_SKIN.format(_TEXTURE) * SKINS + _SKIN.format("") * SKINS}</deformable></mujoco>"""
     )
-    made.geom_size[:] = model.geom_size[planes]
-    made.stat.extent, made.vis.map.zfar = model.stat.extent, model.vis.map.zfar
+    bare_model.geom_size[:] = model.geom_size[planes]
+    bare_model.stat.extent, bare_model.vis.map.zfar = model.stat.extent, model.vis.map.zfar
     for setting in _FIXED:
         part, name = setting.split(".")
-        setattr(getattr(made.vis, part), name, getattr(getattr(model.vis, part), name))
-    return made
+        setattr(getattr(bare_model.vis, part), name, getattr(getattr(model.vis, part), name))
+    return bare_model
 
 
 def fixed(model: mujoco.MjModel) -> list[bytes]:
-    """What a context cannot change for another model: its settings and planes."""
-    planes = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
-    return [np.array(attrgetter(setting)(model.vis)).tobytes() for setting in _FIXED] + [planes.tobytes()]
+    """Return the bytes of a model's settings and planes, which a context cannot change for another model."""
+    plane_sizes = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
+    settings = [np.array(attrgetter(setting)(model.vis)).tobytes() for setting in _FIXED]
+    return [*settings, plane_sizes.tobytes()]
 
 
 def samples(count: int) -> NDArray[np.float32]:
-    """(count, 2) where in a pixel of the current context its samples are, 0 to 1 to the right and up."""
+    """Return the places (count, 2) of the samples in a pixel of the current context, 0 to 1 to the right and up."""
     opengl = calls()
     places = [opengl.glGetMultisamplefv(opengl.GL_SAMPLE_POSITION, sample) for sample in range(count)]
     return np.array(places, np.float32)
 
 
 def adopt_size(context: mujoco.MjrContext, model: mujoco.MjModel) -> None:
-    """Set what ``mjr_makeContext`` computes from a model's size."""
+    """Set the values that ``mjr_makeContext`` computes from a model's size."""
     context.shadowClip = model.stat.extent * model.vis.map.shadowclip
     context.shadowScale = model.vis.map.shadowscale
     context.fogStart = model.stat.extent * model.vis.map.fogstart
@@ -61,25 +62,29 @@ def adopt_size(context: mujoco.MjrContext, model: mujoco.MjModel) -> None:
 
 
 _SKY = -mujoco.mjtTextureRole.mjNTEXROLE + mujoco.mjtTextureRole.mjTEXROLE_RGB
-"""Where a context has the sky's texture: the last of all materials that it has room for is the sky's."""
+"""Index of the sky's texture in ``mat_texid``: the last material of a context's fixed number of materials is the sky's.
+"""
 
 
 def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mujoco.MjModel) -> None:
-    """Replace a former model's textures in a context by a model's. Those that both have stay: a scene has 140 MB."""
-    kinds = [(m.tex_type, m.tex_height, m.tex_width, m.tex_nchannel) for m in (model, former)]
-    there = texels(former)
-    left = dict(enumerate(context.texture[: len(there)].tolist()))
-    copied = []
-    for texture, own in enumerate(texels(model)):
-        for number in left:
-            alike = all(mine[texture] == theirs[number] for mine, theirs in zip(*kinds, strict=True))
-            if alike and np.array_equal(own, there[number]):
-                context.texture[texture] = left.pop(number)
+    """Replace a former model's textures in a context by a model's textures.
+
+    Textures that both models have stay in the context: a scene has 140 MB of textures.
+    """
+    kinds, former_kinds = _texture_kinds(model), _texture_kinds(former)
+    former_texels = texels(former)
+    unclaimed = dict(enumerate(context.texture[: len(former_texels)].tolist()))
+    new_textures = []
+    for texture, values in enumerate(texels(model)):
+        for number in unclaimed:
+            same_kind = kinds[texture] == former_kinds[number]
+            if same_kind and np.array_equal(values, former_texels[number]):
+                context.texture[texture] = unclaimed.pop(number)
                 break
         else:
             context.texture[texture] = calls().glGenTextures(1)
-            copied.append(texture)
-    calls().glDeleteTextures([*left.values()])
+            new_textures.append(texture)
+    calls().glDeleteTextures([*unclaimed.values()])
     context.texture[model.ntex :] = 0
     context.ntexture, context.textureType[: model.ntex] = model.ntex, model.tex_type
     context.mat_texid[: model.mat_texid.size] = model.mat_texid.ravel()
@@ -87,6 +92,12 @@ def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mu
     context.mat_texid[_SKY] = skies[0] if len(skies) else -1
     context.mat_texrepeat[: model.mat_texrepeat.size] = model.mat_texrepeat.ravel()
     context.mat_texuniform[: model.nmat] = model.mat_texuniform
-    for texture in copied:
+    for texture in new_textures:
         mujoco.mjr_uploadTexture(model, context, texture)
         check("mjr_uploadTexture")
+
+
+def _texture_kinds(model: mujoco.MjModel) -> list[tuple[int, int, int, int]]:
+    """Return the type, height, width and number of channels of each texture."""
+    columns = (model.tex_type, model.tex_height, model.tex_width, model.tex_nchannel)
+    return list(zip(*(column.tolist() for column in columns), strict=True))

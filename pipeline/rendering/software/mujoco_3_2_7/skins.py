@@ -22,11 +22,11 @@ GEOM = np.dtype(
 
 
 class Skins:
-    """The skins of a context and a scene made from a ``bare`` model; they render chosen faces of meshes.
+    """Skins of a context and a scene that come from a ``bare`` model; they render chosen faces of meshes.
 
-    A display list always renders the same faces, and recording one takes as long as rendering a third of them. For a
-    skin MuJoCo renders the faces of an index buffer. Before each rendering it would overwrite the skins with those of
-    the bare model, so ``nskin`` is set to 0, which hides them from that step.
+    A display list has fixed faces. Recording a list takes as long as rendering a third of its faces. For a skin, MuJoCo
+    renders the faces of an index buffer. Before each rendering, MuJoCo would overwrite the skins with the bare model's.
+    Setting ``nskin`` to 0 hides the skins from this step.
 
     Attributes:
         rendered: (2 ``SKINS``,) number of faces that each skin renders; the first ``SKINS`` have texture coordinates.
@@ -42,7 +42,13 @@ class Skins:
         self._filled: dict[int, bytes] = {}
 
     def fill_vertices(self, skin: int, faces: Faces, content: bytes) -> None:
-        """Upload a mesh's vertices to a skin, unless they are there."""
+        """Upload a mesh's vertices to a skin, unless the skin has them already.
+
+        Args:
+            skin: the skin's number.
+            faces: the mesh.
+            content: hash of the mesh.
+        """
         if self._filled.get(skin) == content:
             return
         opengl, context = calls(), self._context
@@ -56,10 +62,11 @@ class Skins:
         self._filled[skin] = content
 
     def meshes_of_scene(self) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
-        """The scene's geoms (N,) of ``GEOM``, and which of them are a model's meshes."""
-        shown = self._geoms[: self._scene.ngeom].copy()
-        of_mesh = (shown["type"] == mujoco.mjtGeom.mjGEOM_MESH) & (shown["objtype"] == mujoco.mjtObj.mjOBJ_GEOM)
-        return shown, of_mesh
+        """Return a copy of the scene's geoms (N,) of ``GEOM``, and a mask (N,) of a model's meshes among them."""
+        scene_geoms = self._geoms[: self._scene.ngeom].copy()
+        is_mesh = scene_geoms["type"] == mujoco.mjtGeom.mjGEOM_MESH
+        of_mesh = is_mesh & (scene_geoms["objtype"] == mujoco.mjtObj.mjOBJ_GEOM)
+        return scene_geoms, of_mesh
 
     def fill_faces(self, skin: int, corners: NDArray[np.uint32]) -> None:
         """Upload the index buffer (3 F,) of the faces that a skin renders."""
@@ -71,21 +78,22 @@ class Skins:
             opengl.glBindBuffer(opengl.GL_ELEMENT_ARRAY_BUFFER, 0)
 
     def follow(self, shown: NDArray[np.void], skins: NDArray[np.intp], closing: NDArray[np.intp]) -> None:
-        """Write the scene's geoms; after each with a skin come the skin and its closing mesh (``Meshes``).
+        """Write the scene's geoms; after each geom with a skin come the skin and its closing mesh (``Meshes``).
 
         Args:
-            shown: (N,) of ``GEOM``.
-            skins: (N,) the skin of each, -1 for none.
+            shown: (N,) the scene's geoms, of ``GEOM``.
+            skins: (N,) the skin of each geom, -1 without a skin.
             closing: (K,) number of the closing mesh of each geom that has a skin.
         """
-        having = skins >= 0
-        written = np.repeat(shown, np.where(having, 3, 1))
-        own = np.flatnonzero(having) + 2 * np.arange(np.count_nonzero(having))
-        skin, close = own + 1, own + 2
-        written["type"][skin], written["objid"][skin] = mujoco.mjtGeom.mjGEOM_SKIN, skins[having]
+        has_skin = skins >= 0
+        written = np.repeat(shown, np.where(has_skin, 3, 1))
+        # Each earlier geom with a skin shifts a geom by two places.
+        mesh = np.flatnonzero(has_skin) + 2 * np.arange(np.count_nonzero(has_skin))
+        skin, close = mesh + 1, mesh + 2
+        written["type"][skin], written["objid"][skin] = mujoco.mjtGeom.mjGEOM_SKIN, skins[has_skin]
         written["matid"][close] = -1
         written["dataid"][close] = closing
-        # Decor has no part in the maps of what casts shadows.
+        # Shadow maps have no geoms of the category decor.
         written["category"][skin] = written["category"][close] = mujoco.mjtCatBit.mjCAT_DECOR
         self._scene.ngeom = len(written)
         self._geoms[: len(written)] = written

@@ -20,7 +20,7 @@ def recorded(number: int) -> Iterator[None]:
 
 _VERTICES = "#version 400 compatibility\nvoid main() { gl_Position = gl_Vertex; }"
 
-# The far end of MuJoCo's depth is 0: nothing was rendered there, and what was is the sky, which is in every picture.
+# The far end of MuJoCo's depth is 0. Samples with this depth show no geom, only the sky, which every picture renders.
 _SAMPLES = """#version 400 compatibility
 uniform sampler2DMS colours, depths;
 void main() {
@@ -34,14 +34,15 @@ void main() {
 
 
 class Underlay:
-    """A part of a picture that is rendered once and used in many: colour and depth of every sample.
+    """Part of a picture that is rendered once and used in many pictures: colour and depth of every sample.
 
-    The context must be the current one. Pictures begin in the corner of its off-screen buffer.
+    The context must be the current context. Pictures begin in the corner of its off-screen buffer.
 
     Attributes:
-        number: of the display list that writes the underlay into the off-screen buffer, at samples where nothing nearer
-            was rendered; at equal depth the underlay wins. MuJoCo calls it after all opaque geoms (``Meshes``).
-        content: identifies what was kept; empty at first.
+        number: number of the display list that writes the underlay into the off-screen buffer. It writes only samples
+            at which no nearer geom was rendered; at equal depth the underlay wins. MuJoCo calls the list after all
+            opaque geoms (``Meshes``).
+        content: identifier of the kept picture; empty at first.
     """
 
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
@@ -61,8 +62,12 @@ class Underlay:
         self.content = b""
 
     def keep(self, content: bytes) -> None:
-        """Copy the off-screen buffer."""
-        # Of less than all, OpenGL here does not copy each sample by itself.
+        """Copy the off-screen buffer.
+
+        Args:
+            content: identifier of the picture in the buffer.
+        """
+        # Disable the scissor test: OpenGL here copies each sample separately only if it copies the whole buffer.
         opengl, rectangle = calls(), (0, 0, self._width, self._height)
         opengl.glPushAttrib(opengl.GL_SCISSOR_BIT)
         opengl.glDisable(opengl.GL_SCISSOR_TEST)
@@ -76,6 +81,7 @@ class Underlay:
         self.content = content
 
     def _draw(self) -> None:
+        """Write the kept colour and depth into the current buffer."""
         opengl = calls()
         opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)
         for setting in ("ALPHA_TEST", "BLEND", "CULL_FACE", "POLYGON_OFFSET_FILL", "STENCIL_TEST"):
@@ -96,7 +102,7 @@ class Underlay:
         opengl.glPopAttrib()
 
     def _texture(self, renderbuffer: int, samples: int) -> int:
-        """A texture for as many samples as a renderbuffer has, in its format: others cannot be copied as they are."""
+        """Create a texture with a renderbuffer's number of samples and format, which an exact copy needs."""
         opengl = calls()
         opengl.glBindRenderbuffer(opengl.GL_RENDERBUFFER, renderbuffer)
         kind = opengl.glGetRenderbufferParameteriv(opengl.GL_RENDERBUFFER, opengl.GL_RENDERBUFFER_INTERNAL_FORMAT)
@@ -107,6 +113,11 @@ class Underlay:
         return texture
 
     def _shaders(self) -> int:
+        """Compile and link the program that writes the underlay, and return its number.
+
+        Raises:
+            PipelineError: if OpenGL rejects the shaders.
+        """
         opengl = calls()
         program: int = opengl.glCreateProgram()
         for kind, text in ((opengl.GL_VERTEX_SHADER, _VERTICES), (opengl.GL_FRAGMENT_SHADER, _SAMPLES)):
@@ -117,7 +128,7 @@ class Underlay:
             opengl.glDeleteShader(shader)
         opengl.glLinkProgram(program)
         if not opengl.glGetProgramiv(program, opengl.GL_LINK_STATUS):
-            raise failure(f"OpenGL refuses the shaders of underlays: {opengl.glGetProgramInfoLog(program)!r}")
+            raise failure(f"OpenGL rejects the shaders of underlays: {opengl.glGetProgramInfoLog(program)!r}")
         opengl.glUseProgram(program)
         for unit, name in enumerate(("colours", "depths")):
             opengl.glUniform1i(opengl.glGetUniformLocation(program, name), unit)
