@@ -1,4 +1,4 @@
-"""Reader of RLDS folders that follows OpenVLA-OFT's loader, without OFT and without TensorFlow, and a check of datasets.
+"""Reader of RLDS folders that follows OpenVLA-OFT's loader without OFT and without TensorFlow, and a check of datasets.
 
 The reader repeats the steps of OFT in OFT's order:
 
@@ -200,7 +200,7 @@ def check_run(data: Path) -> dict[str, dict[str, Any]]:
 
 
 def _faults(episode: Recorded) -> Iterator[str]:
-    """Yield a text for each way in which an episode differs from the schema."""
+    """Yield a text for each fault of an episode."""
     steps = len(episode.action)
     if steps < CHUNK:
         yield f"has {steps} steps, fewer than a chunk of {CHUNK}"
