@@ -32,7 +32,7 @@ EPISODES_A_JOB = 10
 """Largest number of episodes in a job. Smaller jobs spread better over workers; larger jobs build fewer scenes."""
 
 JOBS_A_WORKER = 4
-"""Smallest number of jobs per worker. With few episodes, jobs get smaller, so that all workers end at a similar time."""
+"""Number of jobs per worker below which jobs get smaller, so that all workers end at a similar time."""
 
 SCENE_AXES = ("pose", "layout", "light", "background")
 """Axes whose test tasks each have their own scene."""
@@ -252,8 +252,8 @@ def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvi
         mujoco.gl_context.GLContext(1, 1).free()
         atexit.register(environment.close)
     else:
-        # Only the thread that rendered may close the environment. A worker's thread is gone when its process ends, so an
-        # extra reference keeps Python from closing the environment.
+        # Only the thread that rendered may close the environment. A worker's thread is gone when its process ends, so
+        # an extra reference keeps Python from closing the environment.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(environment))
     return environment
 

@@ -100,13 +100,13 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
         evaluation = self._evaluation(settings, archive)
         size_px = self.observation_height, self.observation_width
         tasks: dict[str, list[EvaluationTask]] = {}
-        every_task: list[EvaluationTask] = []
         for suite in (self.task or "").split(","):
             named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
             chosen = {"suites": (suite.strip(),), **{name: getattr(self, name) for name in named}}
             selection = Selection.model_validate(chosen)
             # Sorted by scene, so that each scene is built once.
             tasks[suite.strip()] = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
+        every_task: list[EvaluationTask] = []
         for suite_tasks in tasks.values():
             every_task += suite_tasks
         check_settings(selection, every_task, settings)

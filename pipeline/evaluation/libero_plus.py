@@ -115,7 +115,7 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
 
 @cache
 def postures_rad() -> dict[int, tuple[float, ...]]:
-    """Return the number of a robot task's start to the (7,) joint angles in its class's table, with all their digits."""
+    """Return start number of robot tasks to the (7,) joint angles in the start's class, with all their digits."""
     source = _reader().packed("envs/robots/mounted_panda.py").decode()
     listed = re.findall(r"class MountedPanda(\d+)\(.*?np\.array\(\[([^\]]+)\]\)", source, flags=re.DOTALL)
     return {int(number): tuple(map(float, row.split(","))) for number, row in listed}
