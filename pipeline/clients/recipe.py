@@ -44,8 +44,8 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
     """Return the fine-tuning recipe of a run.
 
     Args:
-        manifest_file: the run's manifest. Its hash identifies the datasets, because it stores for every episode the
-            content hash, the place in each format, and the versions and the device that generated the episode.
+        manifest_file: the run's manifest, whose hash identifies the datasets. The manifest stores the content hash of
+            every episode, its place in each format, and the versions and the device that generated it.
         export: the datasets that the run exports; its RLDS name is OpenVLA-OFT's name for all RLDS datasets.
     """
     kept = [row for row in rows if row["kept"]]

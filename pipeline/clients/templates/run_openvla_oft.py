@@ -8,7 +8,7 @@ OFT always logs to Weights & Biases; offline logging needs no account. With an a
 --wandb_project NAME`` instead. Further arguments are passed to OFT's ``vla-scripts/finetune.py`` and override the
 settings. Examples are ``--dataset_name libero_perturbed_spatial`` for one suite, and ``--max_steps 20000``.
 
-To continue for N steps from a checkpoint that was trained on LIBERO, saved at STEP in the folder CHECKPOINT, add
+A checkpoint that was trained on LIBERO and saved at STEP in the folder CHECKPOINT can be trained for N more steps. Add
 
     --vla_path CHECKPOINT --statistics CHECKPOINT/dataset_statistics.json --resume True --resume_step STEP
     --max_steps STEP+N
