@@ -12,9 +12,9 @@ independence predicts (LIBERO-Plus, section on compositional generalisation). It
 pairs, for OpenVLA-OFT.
 
 The paper tests the gap by Pearson's chi-square of the successes. The test assumes that successes are as uncertain as
-counts of rare events. The assumption fails: the number of successes of a combination that succeeds in 95 % of its
-trials has a twentieth of that variance, and the four combinations of a trial are correlated. At high success the test
-nearly never rejects, even if there is a gap. The test is kept as the paper's figure. The interval is computed by
+counts of rare events. The assumption fails. If a combination succeeds in 95 % of its trials, its number of
+successes has a twentieth of that variance. Also, the four combinations of a trial are correlated. At high success the
+test nearly never rejects, even if there is a gap. The test is kept as the paper's figure. The interval is computed by
 bootstrap over trials.
 """
 

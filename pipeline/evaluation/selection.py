@@ -45,7 +45,7 @@ SIZE = 10_000
 
 
 class Selection(Frozen, use_attribute_docstrings=True):
-    """Selection of tasks; fields with their default do not restrict it."""
+    """Selection of tasks; a field that is left out does not restrict it."""
 
     source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
     """LIBERO's tasks; LIBERO-Plus's test tasks; held-out perturbations on this project's axes (``own``); LIBERO's tasks

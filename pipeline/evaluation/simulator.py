@@ -27,9 +27,10 @@ OBSERVED = 24
 """Number of the substep, among the 25 of a control step, that robosuite 1.4.0 observes.
 
 An observable samples once per 50 ms, by a timer that counts every update. A reset and LIBERO's ``set_init_state`` force
-one update each, so the timer is two substeps ahead. Therefore the 24th substep is observed, not the last, and the
-policy sees a state of the arm that is 2 to 4 ms old (``Observable.update`` in ``robosuite/utils/observables.py``). In a
-test, an ``Observable`` that was updated twice observed the 24th substep in each of 20,000 control steps.
+one update each, so the timer is two substeps ahead. Therefore the 24th substep is observed, not the last. The
+policy sees a state of the arm that is 2 to 4 ms old. Source: ``Observable.update`` in
+``robosuite/utils/observables.py``. In a test, an ``Observable`` that was updated twice observed the 24th substep in
+each of 20,000 control steps.
 """
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -98,7 +99,7 @@ class Simulator(Environment):
                 part of the state.
             state: (S,) flattened MuJoCo state: time, qpos, qvel.
             posture_rad: (7,) joint angles of the arm in the reset; LIBERO's own by default. The state moves the arm
-                at once, but the controller keeps the goal orientation and the null-space posture of the reset, and
+                at once. But the controller keeps the goal orientation and the null-space posture of the reset, and
                 drives the arm to them.
         """
         env = self._env.env

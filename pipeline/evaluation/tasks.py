@@ -33,8 +33,8 @@ Source = Literal["libero", "libero_plus", "own", "goals"]
 Prompt = Literal["clean", "benchmark", "blank"]
 """Kind of instruction for a policy.
 
-``clean`` is LIBERO's instruction. ``benchmark`` is, in test tasks, the instruction in the benchmark's code, which is
-the name of the task's file ("turn on the stove view 0 0 100 2 352 initstate 0"). ``blank`` is an empty instruction.
+``clean`` is LIBERO's instruction. ``benchmark`` is, in test tasks, the instruction in the benchmark's code: the name of
+the task's file, such as "turn on the stove view 0 0 100 2 352 initstate 0". ``blank`` is an empty instruction.
 """
 
 
@@ -166,9 +166,8 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
     A new object can be moved and carries nothing. It is not in the goal yet, and the place is not named after it (a
     region beside a plate is named after the plate). It is the only object of its category, and its words mean it alone.
 
-    The new object fits in the old object's place if one of two conditions holds. One of LIBERO's 130 tasks puts an
-    object of its category on or in a thing of the same kind. Or the new object is no larger than an object that one of
-    these tasks puts there.
+    The new object fits in the old object's place if one of LIBERO's 130 tasks puts its category on or in a thing of
+    this kind. It also fits if it is no larger than an object that one of these tasks puts there.
     """
     scene = bddl.read(task.bddl_file)
     named: set[str] = set()
