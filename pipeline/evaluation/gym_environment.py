@@ -110,7 +110,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         gl.prepare()
         if self._environment.reset(task).over:
             raise PipelineError(
-                "the scene refuses what was sampled", where=str(task), remedy="name others by --env.tasks"
+                "the scene rejects the perturbation", where=str(task), remedy="name other tasks by --env.tasks"
             )
         return self._look(), {"is_success": False}
 

@@ -95,7 +95,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             policy = PolicyConfig(kind="server", address="of the harness", label=label)
             self._evaluation = Evaluation(episodes, policy, policy.identity(), Path(out), archive=self._archive)
         elif label:
-            raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR beside it")
+            raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR next to it")
         self._next_look = NextLook(self._environment.settings.look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
@@ -116,7 +116,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         progress = self._environment.reset(EvaluationTask.of_harness(task))
         if progress.over:
             self._save()
-            raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
+            raise PipelineError("the scene rejects the perturbation", where=task["name"], remedy="leave this task out")
         self._next_look.left = 0
         return self._look()
 

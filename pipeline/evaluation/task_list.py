@@ -55,8 +55,8 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
         raise PipelineError(
             "this version draws other perturbations for these tasks",
             where=file,
-            expected="a list that it made",
-            remedy="make the list anew with the command that made it, or evaluate with the version that made it",
+            expected="a list of this version",
+            remedy="generate the list again with the same command, or evaluate with the version that generated it",
         )
     return listed.tasks
 
