@@ -204,7 +204,7 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         """Begin a replay of the episode's demonstration."""
-        replay = TrackedReplay() if self._tracked else Replay(self._chunk)
+        replay: Replay | TrackedReplay = TrackedReplay() if self._tracked else Replay(self._chunk)
         self._replays[ctx.session_id] = replay
         replay.begin(EvaluationTask.of_harness(config["task"]))
 
