@@ -1,1 +1,1 @@
-"""What the training codes that read the datasets expect: recipes, templates, and checks that read as they do."""
+"""Recipes and templates for the training codes that read the datasets, and checks that read like these codes."""

@@ -1,9 +1,12 @@
-"""Read an RLDS folder the way OpenVLA-OFT's loader does, without OFT and without TensorFlow, and check what it gets.
+"""Reader of RLDS folders that follows OpenVLA-OFT's loader without OFT and without TensorFlow, and a check of datasets.
 
-Followed, in OFT's order: ``libero_dataset_transform`` (gripper to 1 open, 0 close; state split into end effector and
-fingers), normalisation to [-1, 1] by the 1st and 99th percentile, trajectories without an instruction left out, and
-``chunk_act_obs``, which gives a trajectory of T steps T - 7 samples of 8 actions: none starts where fewer than 8 are
-left, so nothing is padded.
+The reader repeats the steps of OFT in OFT's order:
+
+* ``libero_dataset_transform`` maps the gripper to 1 open, 0 close. It splits the state into end effector and fingers.
+* Normalisation maps the 1st and 99th percentile to [-1, 1].
+* Trajectories without an instruction are left out.
+* ``chunk_act_obs`` makes T - 7 samples of 8 actions from a trajectory of T steps. No sample starts with fewer than 8
+  steps left, so nothing is padded.
 """
 
 import io
@@ -32,7 +35,7 @@ VIEWS = {"image_primary": "image", "image_wrist": "wrist_image"}
 """OFT's name of a view to its name in the dataset."""
 
 SAME = 1e-9
-"""Largest difference between statistics read back and those stored; both are computed in double precision."""
+"""Largest difference between measured and stored statistics; both are computed in double precision."""
 
 SETTLED = 5
 """Steps (a quarter of a second) after which the fingers have clearly followed a turn of the command."""
@@ -40,10 +43,10 @@ SETTLED = 5
 
 @dataclass(frozen=True)
 class Recorded:
-    """An episode as it is stored.
+    """Episode as stored in the dataset.
 
     Attributes:
-        name: its ``episode_id``.
+        name: the episode's ``episode_id``.
         action: (T, 7) float32, gripper -1 open, +1 close.
         state: (T, 8) float32, end-effector pose and fingers.
         frames: view (``image``, ``wrist_image``) to T JPEG files.
@@ -59,7 +62,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Samples:
-    """What OFT makes of an episode: one sample for each place at which a whole chunk begins, S = T - 7 in all.
+    """Training samples that OFT makes from an episode: one for each start of a whole chunk, S = T - 7 in total.
 
     Attributes:
         prompt: the instruction, lower-cased as OFT prompts with it.
@@ -78,10 +81,10 @@ class Samples:
 
 
 def read(folder: Path) -> Iterator[Recorded]:
-    """The episodes of a version folder, shard by shard, frames left encoded.
+    """Yield the episodes of a version folder, shard by shard; frames stay encoded.
 
     Raises:
-        PipelineError: naming the file and the record, when a checksum is wrong or a feature that OFT reads is missing.
+        PipelineError: if a checksum is wrong or a feature that OFT reads is missing; it names the file and the record.
     """
     features = tfds.builder_from_directory(folder).info.features
     for shard in sorted(folder.glob("*.tfrecord-*")):
@@ -102,7 +105,10 @@ def read(folder: Path) -> Iterator[Recorded]:
 
 
 def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Samples | None:
-    """What OFT trains on, or None where it passes the episode by: no instruction, or fewer than 8 steps."""
+    """Return the samples that OFT trains on.
+
+    Return `None` if OFT skips the episode: it has no instruction, or fewer than 8 steps.
+    """
     if not any(episode.instructions) or len(episode.action) < CHUNK:
         return None
     action = normalise(exact_statistics.open_is_one(episode.action), statistics["action"])
@@ -119,9 +125,9 @@ def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Samples | No
 
 
 def normalise(values: NDArray[np.float32], figures: Mapping[str, Any]) -> NDArray[np.float32]:
-    """Columns of ``values`` (T, D) mapped from [q01, q99] to [-1, 1] and clipped; a constant column becomes 0.
+    """Map the columns of ``values`` (T, D) from [q01, q99] to [-1, 1] and clip them; a constant column becomes 0.
 
-    Where ``figures`` has a mask, columns that it leaves out stay as they are (the gripper).
+    If ``figures`` has a mask, columns outside the mask keep their values (the gripper).
     """
     low, high, smallest, largest = (np.asarray(figures[name]) for name in ("q01", "q99", "min", "max"))
     mask = np.asarray(figures.get("mask", [True] * values.shape[1]))
@@ -130,17 +136,23 @@ def normalise(values: NDArray[np.float32], figures: Mapping[str, Any]) -> NDArra
 
 
 def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
-    """Read a dataset as OFT would and say what it finds, JSON-serialisable.
+    """Read a dataset as OFT would and report counts and violations, JSON-serialisable.
 
     Args:
-        statistics: what ``dataset_statistics.json`` has, by dataset.
+        statistics: content of ``dataset_statistics.json``: dataset to its statistics.
 
     Returns:
-        ``episodes``, ``steps`` and ``chunks`` (training samples), ``passed_by`` (episodes that OFT would not use),
-        ``clipped_share`` (of the arm's normalised action entries that lie on a bound), ``statistics_difference``
-        (largest, between what was read and ``statistics``) and ``violations``, texts.
+        Dictionary with these keys. If ``statistics`` lacks the dataset, it has ``violations`` only. If OFT would train
+        on no episode, it has ``episodes`` and ``violations`` only.
+
+        * ``episodes``, ``steps`` and ``chunks`` (training samples): counts.
+        * ``passed_by``: number of episodes that OFT would not use.
+        * ``clipped_share``: share of the arm's normalised action entries that are equal to a bound.
+        * ``statistics_difference``: largest difference between the measured statistics and ``statistics``.
+        * ``violations``: texts.
     """
-    if (stored := statistics.get(folder.parent.name)) is None:
+    stored = statistics.get(folder.parent.name)
+    if stored is None:
         return {"violations": ["dataset_statistics.json has nothing on it"]}
     violations: list[str] = []
     motions: list[exact_statistics.Motion] = []
@@ -153,7 +165,8 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
         if faults:
             continue
         motions.append((episode.action, episode.state))
-        if (trained := trajectory(episode, stored)) is not None:
+        trained = trajectory(episode, stored)
+        if trained is not None:
             samples.append(len(trained))
             clipped += int((np.abs(trained.actions[:, 0, :6]) == 1).sum())
     if not samples:
@@ -179,7 +192,7 @@ def check_all(rlds: Path, statistics_file: Path) -> dict[str, dict[str, Any]]:
     """Check every dataset below a folder against ``dataset_statistics.json``; keys are dataset names.
 
     Raises:
-        PipelineError: when there is no dataset, or a file that cannot be read.
+        PipelineError: if there is no dataset, or if a file cannot be read.
     """
     folders = datasets(rlds)
     statistics = read_json(statistics_file)
@@ -187,6 +200,7 @@ def check_all(rlds: Path, statistics_file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _faults(episode: Recorded) -> Iterator[str]:
+    """Yield a text for each fault of an episode."""
     steps = len(episode.action)
     if steps < CHUNK:
         yield f"has {steps} steps, fewer than a chunk of {CHUNK}"
@@ -206,6 +220,7 @@ def _faults(episode: Recorded) -> Iterator[str]:
 
 
 def _is_frame(data: bytes) -> bool:
+    """Return whether an encoded image is an RGB JPEG of the schema's size."""
     height, width, _ = SCHEMA.frame.shape
     try:
         with Image.open(io.BytesIO(data)) as image:  # reads the header only
@@ -215,7 +230,11 @@ def _is_frame(data: bytes) -> bool:
 
 
 def _closes_on_open(motions: Sequence[exact_statistics.Motion]) -> bool:
-    """Whether the fingers, on the whole, part after the command turns positive and close after it turns negative."""
+    """Return whether the gripper's command has the wrong sign.
+
+    The sign is wrong if the fingers, in sum over all turns of the command, follow it the other way round: they open
+    after it turns positive and close after it turns negative.
+    """
     moved = 0.0
     for action, state in motions:
         command, gap = np.sign(action[:, -1]), state[:, 6] - state[:, 7]
@@ -225,16 +244,20 @@ def _closes_on_open(motions: Sequence[exact_statistics.Motion]) -> bool:
 
 
 def _difference(measured: Mapping[str, Any], stored: Mapping[str, Any]) -> float:
-    """Largest absolute difference between two entries of ``dataset_statistics.json``; infinite where shapes differ or
-    what is stored is NaN."""
+    """Return the largest absolute difference between two entries of ``dataset_statistics.json``.
+
+    The difference is infinite if shapes differ, or if a stored value is missing or NaN.
+    """
     largest = 0.0
     for name, value in measured.items():
-        other = stored.get(name)
+        reference = stored.get(name)
         if isinstance(value, Mapping):
-            off = _difference(value, other) if isinstance(other, Mapping) else np.inf
-        elif other is None or np.shape(value) != np.shape(other) or np.isnan(np.asarray(other, float)).any():
-            off = np.inf
+            difference = _difference(value, reference) if isinstance(reference, Mapping) else np.inf
+        elif (
+            reference is None or np.shape(value) != np.shape(reference) or np.isnan(np.asarray(reference, float)).any()
+        ):
+            difference = np.inf
         else:
-            off = float(np.abs(np.asarray(value, float) - np.asarray(other, float)).max())
-        largest = max(largest, off)
+            difference = float(np.abs(np.asarray(value, float) - np.asarray(reference, float)).max())
+        largest = max(largest, difference)
     return largest

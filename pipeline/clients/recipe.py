@@ -1,4 +1,4 @@
-"""The fine-tuning recipe and, beside it, what the clients need to train on a run's datasets."""
+"""The fine-tuning recipe of a run, and the files that the clients need to train on its datasets."""
 
 import json
 import shutil
@@ -25,31 +25,31 @@ RECIPE = "finetune.yaml"
 TEMPLATES = Path(__file__).parent / "templates"
 OFT_SCRIPT = "run_openvla_oft.py"
 LEROBOT_TRAIN = "lerobot_train.json"
-"""Written where a validation split is held out: the other episodes, as lerobot-train reads them from a file.
+"""File for lerobot-train with the training episodes, written if a validation split is held out.
 
-On a command line, 25,000 of them would be too long for Linux.
+A command line with 25,000 episodes would be too long for Linux.
 """
 
 OPENPI = "pi05_libero"
-"""openpi's configuration that is trained and served."""
+"""openpi's configuration for training and serving."""
 OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
-"""Where that configuration looks for statistics, below the folder of its assets, when it serves what it trained."""
+"""Path of the statistics below the configuration's assets folder; the configuration reads it to serve a policy."""
 
 MANIFEST = "manifest.parquet of this run"
 
 
 def sourced(value: Any, source: str) -> dict[str, Any]:
-    """A field of the recipe."""
+    """Return a field of the recipe."""
     return {"value": value, "source": source}
 
 
 def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: ExportConfig) -> dict[str, Any]:
-    """The fine-tuning recipe of a run.
+    """Return the fine-tuning recipe of a run.
 
     Args:
-        manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
-            episode, its place in each format, and the versions and the device that made it.
-        export: the datasets that the run asks for; OpenVLA-OFT calls all of RLDS by the name there.
+        manifest_file: the run's manifest, whose hash identifies the datasets. The manifest stores the content hash of
+            every episode, its place in each format, and the versions and the device that generated it.
+        export: the datasets that the run exports; its RLDS name is OpenVLA-OFT's name for all RLDS datasets.
     """
     kept = [row for row in rows if row["kept"]]
     counts: dict[str, Counter[str]] = defaultdict(Counter)
@@ -71,7 +71,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
             {export.rlds.name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
             f"OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn {often}",
         )
-        # It asks every set for its split.
+        # OFT requests the validation split from every dataset.
         oft_validates = bool(validating) and validating == {*suites.values()}
     if export.lerobot is not None:
         dataset["lerobot"] = sourced(export.lerobot.name, "the run's configuration, export.lerobot.name")
@@ -79,15 +79,17 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
 
 
 def _training_and_clients(export: ExportConfig, oft_validates: bool) -> dict[str, Any]:
+    """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``."""
     cameras = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), 1)}
-    known = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
-    known |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
-    known |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
-    sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **known))
+    values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
+    values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
+    values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
+    sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
     return sections
 
 
 def _filled(template: str, **values: object) -> str:
+    """Render a Jinja template of this package."""
     environment = Environment(
         loader=PackageLoader("pipeline.clients"),
         undefined=StrictUndefined,
@@ -99,7 +101,7 @@ def _filled(template: str, **values: object) -> str:
 
 
 def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, datasets: Mapping[str, Path]) -> None:
-    """Generate the folder ``finetune``: ``finetune.yaml``, the clients' scripts and the files that these read.
+    """Generate the folder ``finetune``: ``finetune.yaml``, the clients' scripts and the scripts' input files.
 
     Args:
         folder: the folder to generate; the scripts look for ``rlds`` next to it.
@@ -117,8 +119,8 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
             shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
         if export.lerobot is not None and export.lerobot.validation:
             info = read_json(datasets["lerobot"] / export.lerobot.name / "meta" / "info.json")
-            listed = [*range(int(info["splits"]["train"].partition(":")[2]))]
-            (unfinished / LEROBOT_TRAIN).write_text(json.dumps({"dataset": {"episodes": listed}}) + "\n")
+            episodes = [*range(int(info["splits"]["train"].partition(":")[2]))]
+            (unfinished / LEROBOT_TRAIN).write_text(json.dumps({"dataset": {"episodes": episodes}}) + "\n")
         if wanted is not None and wanted.convention == "openpi":
             table = pq.read_table(datasets["lerobot_v21"] / wanted.name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
@@ -132,10 +134,11 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
 
 
 class _Dumper(yaml.SafeDumper):
-    """Leaves quotation marks as they are, so that a command can be copied."""
+    """YAML dumper that leaves quotation marks unescaped, so that commands can be copied."""
 
 
 def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
+    """Represent a text, as a literal block if it contains quotation marks."""
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if '"' in text else None)
 
 

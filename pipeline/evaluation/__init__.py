@@ -1,9 +1,9 @@
-"""Policies run on LIBERO's tasks, LIBERO-Plus's test tasks and held-out perturbations of the axes.
+"""Evaluation of policies on LIBERO's tasks, LIBERO-Plus's test tasks and held-out perturbations of the axes.
 
-Modules, each above those that it uses:
+Modules, each listed above the modules that it uses:
 
 * ``harness``: for vla-eval. ``lerobot_eval``: for lerobot-eval, over ``gym_environment``. ``composition``: the gap.
-* ``evaluate``: all episodes, in worker processes. ``rollout``: one, from task to row. ``selection``: the tasks named.
-* ``environment`` over ``simulator``: starts an episode, shows it, takes actions. ``reference_policies``, ``policies``.
-* ``statistics``, ``results``; ``libero_plus``, ``own_draws``, ``tasks``: where tasks come from, and what one is.
+* ``evaluate``: all episodes, in worker processes. ``rollout``: one episode, from task to row. ``selection``: tasks.
+* ``environment`` over ``simulator``: starts episodes, observes, takes actions. ``reference_policies``, ``policies``.
+* ``statistics``, ``results``; ``libero_plus``, ``own_draws``, ``tasks``: sources of tasks, and their identification.
 """

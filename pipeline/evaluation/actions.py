@@ -1,4 +1,4 @@
-"""What a policy may answer with: finite numbers, of the kind that LIBERO's controller takes."""
+"""Checks of a policy's answer: finite numbers, in the action format of LIBERO's controller."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,14 +10,14 @@ from pipeline.types import Floats
 
 
 class PolicyError(PipelineError):
-    """The policy gave no action: this episode has no result, others may have one."""
+    """Error of a policy that gave no action: this episode has no result, other episodes may have one."""
 
 
 def checked_actions(answer: Any, policy: str) -> Floats:
-    """(n, 7) what a policy answered, one action or several.
+    """Return a policy's answer, one action (7,) or several, as an (n, 7) array.
 
     Raises:
-        PolicyError: when it is anything but finite numbers of that shape.
+        PolicyError: if the answer is not finite numbers of these shapes.
     """
     expected = "(7,) or (n, 7) finite numbers: three of position, three of rotation, and the gripper"
     try:
@@ -33,29 +33,30 @@ def checked_actions(answer: Any, policy: str) -> Floats:
 
 FORMATS = {
     "position": ("delta_xyz", "raw"),
-    # GR00T's server says euler_xyz of what its policy learns from LIBERO's data, which is an axis-angle.
+    # GR00T's server announces euler_xyz, but its policy learns axis-angles from LIBERO's data.
     "rotation": ("axis_angle", "euler_xyz", "raw"),
     "gripper": ("binary_close_positive", "raw"),
 }
-"""Part of an action to the formats that can be executed, as vla-eval names them; ``raw`` says nothing."""
+"""Part of an action to the formats that can be executed, in vla-eval's names; ``raw`` leaves the format open."""
 
 
 def refuse_other_actions(params: Mapping[str, Any], spec: Mapping[str, Mapping[str, Any]], server: str) -> None:
-    """Have a model server answer with deltas and a gripper that opens below 0.
+    """Reject a model server whose actions are not deltas with a gripper that opens below 0.
 
     Args:
-        params, spec: ``observation_params`` and ``action_spec``, as the server announces them.
+        params: the ``observation_params`` that the server announces.
+        spec: the ``action_spec`` that the server announces.
 
     Raises:
-        PipelineError: when it announces other actions.
+        PipelineError: if the server announces other actions.
     """
-    other = ["absolute_action"] if params.get("absolute_action") else []
-    other += [
-        f"{part} {one['format']}" for part, one in spec.items() if one["format"] not in FORMATS.get(part, ("raw",))
-    ]
-    if other:
+    unsupported = ["absolute_action"] if params.get("absolute_action") else []
+    for part, dimension in spec.items():
+        if dimension["format"] not in FORMATS.get(part, ("raw",)):
+            unsupported.append(f"{part} {dimension['format']}")
+    if unsupported:
         raise PipelineError(
-            f"the server's actions cannot be executed: it announces {', '.join(other)}",
+            f"the server's actions cannot be executed: it announces {', '.join(unsupported)}",
             where=server,
             expected="deltas of position and axis-angle, and a gripper that opens below 0 and else closes",
             remedy="GR00T's server has --args.invert_gripper for the gripper. Absolute actions, such as X-VLA's with "

@@ -1,19 +1,21 @@
-"""The compositional gap: whether two perturbations together cost more successes than each of them does by itself.
+"""The compositional gap: a test of two perturbations that cost more successes together than each of them does alone.
 
-D_i is 1 where the first perturbation is there, D_j where the second is, Y is success. With s(d_i, d_j) the success rate
-of a combination, as many trials of each:
+D_i is 1 if the first perturbation is applied, D_j if the second is applied, and Y is success. All four combinations
+have equally many trials. With s(d_i, d_j) the success rate of a combination:
 
     p(D_i = 1, D_j = 1 | Y = 1) = s(1, 1) / sum of s
     p(D_i = 1 | Y = 1) = (s(1, 0) + s(1, 1)) / sum of s
     gap = p(D_i = 1, D_j = 1 | Y = 1) - p(D_i = 1 | Y = 1) p(D_j = 1 | Y = 1)
 
-which is the covariance of D_i and D_j among successes: negative where both together hurt more than independence says
-(LIBERO-Plus, its section on compositional generalisation; negative in all its pairs, for OpenVLA-OFT).
+The gap is the covariance of D_i and D_j among successes. It is negative if both perturbations together hurt more than
+independence predicts (LIBERO-Plus, section on compositional generalisation). It is negative in all of the paper's
+pairs, for OpenVLA-OFT.
 
-The paper tests it by Pearson's chi-square of the successes, as if successes were as uncertain as counts of rare events
-are. They are not: of a combination that succeeds in 95 % of its trials, their number has a twentieth of that variance,
-and the four combinations of a trial go together. So at high success it nearly never rejects, also where there is a gap.
-It is kept as the paper's figure; the interval is by bootstrap over trials.
+The paper tests the gap by Pearson's chi-square of the successes. The test assumes that successes are as uncertain as
+counts of rare events. The assumption fails. If a combination succeeds in 95 % of its trials, its number of
+successes has a twentieth of that variance. Also, the four combinations of a trial are correlated. At high success the
+test nearly never rejects, even if there is a gap. The test is kept as the paper's figure. The interval is computed by
+bootstrap over trials.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,16 +36,22 @@ from pipeline.files import replaced
 from pipeline.types import Floats
 
 TITLE = "perturbed-demos: compositional gap"
-"""Title in the metadata of a heat map, by which `analyse gap` knows its own."""
+"""Title in the metadata of a heat map; `analyse gap` recognises its own files by this title."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two axes, and the successes of their four combinations.
+    """Pair of axes, and the successes of their four combinations.
 
     Attributes:
-        trials: episodes of each combination, on the same tasks, initial states and draws.
-        interval: of the gap, by bootstrap over trials; None where only the counts are known.
+        one: the first axis.
+        other: the second axis.
+        trials: number of episodes of each combination; all combinations share tasks, initial states and perturbations.
+        neither: successes without a perturbation.
+        only_one: successes with the first axis alone.
+        only_other: successes with the second axis alone.
+        both: successes with both axes.
+        interval: interval of the gap, by bootstrap over trials; `None` if only the counts are known.
     """
 
     one: str
@@ -57,26 +65,31 @@ class Pair:
 
     @property
     def joint(self) -> float:
-        """p(D_i = 1, D_j = 1 | Y = 1); NaN without successes."""
+        """Return p(D_i = 1, D_j = 1 | Y = 1); NaN without successes."""
         return float(_probabilities(self._sums)[0][0])
 
     @property
     def product(self) -> float:
-        """p(D_i = 1 | Y = 1) p(D_j = 1 | Y = 1); NaN without successes."""
+        """Return p(D_i = 1 | Y = 1) p(D_j = 1 | Y = 1); NaN without successes."""
         return float(_probabilities(self._sums)[1][0])
 
     @property
     def gap(self) -> float:
+        """Return the joint probability minus the product; NaN without successes."""
         return float(gap(self._sums)[0])
 
     @property
     def _sums(self) -> Floats:
+        """Return the (1, 4) successes as ``gap`` takes them."""
         return np.array([[self.neither, self.only_one, self.only_other, self.both]], float)
 
     def chi_square(self) -> tuple[float, float]:
-        """The paper's test: Pearson's statistic of the successes by D_i and D_j, with one degree of freedom and without
-        a correction for continuity, and the probability of one as large if these were independent; NaN where it is not
-        defined."""
+        """Return the statistic and the p-value of the paper's test.
+
+        The test is Pearson's chi-square of the successes by D_i and D_j, with one degree of freedom and without a
+        correction for continuity. The p-value is the probability of a statistic as large or larger if D_i and D_j were
+        independent. Both numbers are NaN if the test is not defined.
+        """
         table = np.array([[self.neither, self.only_other], [self.only_one, self.both]])
         if not (table.any(axis=0).all() and table.any(axis=1).all()):
             return float("nan"), float("nan")
@@ -84,7 +97,7 @@ class Pair:
         return float(tested.statistic), float(tested.pvalue)
 
     def figures(self) -> dict[str, Any]:
-        """All of it, JSON-serialisable: None where a number is not defined."""
+        """Return all figures of the pair, JSON-serialisable; undefined numbers are `None`."""
         statistic, p_value = self.chi_square()
         counts = {"neither": self.neither, "one": self.only_one, "other": self.only_other, "both": self.both}
         return {
@@ -97,32 +110,44 @@ class Pair:
 
 
 def gap(sums: Floats) -> Floats:
-    """The gap, of (n, 4) successes without a perturbation, with the one, the other and both; NaN without successes."""
+    """Compute the (n,) gaps from (n, 4) successes; NaN without successes.
+
+    Args:
+        sums: columns are successes without a perturbation, with the first axis, with the second axis, and with both.
+    """
     joint, product = _probabilities(sums)
     return joint - product
 
 
 def _probabilities(sums: Floats) -> tuple[Floats, Floats]:
-    """(n,) the joint probabilities, and the products of the marginal ones."""
-    _, one, other, both = sums.T
+    """Compute the (n,) joint probabilities, and the (n,) products of the marginal probabilities."""
+    _, only_first, only_second, both = sums.T
     whole = np.where(sums.any(axis=1), sums.sum(axis=1), np.nan)
-    return np.asarray(both / whole, float), np.asarray((one + both) * (other + both) / whole**2, float)
+    product = (only_first + both) * (only_second + both) / whole**2
+    return np.asarray(both / whole, float), np.asarray(product, float)
 
 
-def pairs(found: Iterable[Stored]) -> list[Pair]:
-    """Every pair of axes that the results have, of the trials of which all four combinations were run.
+def pairs(results: Iterable[Stored]) -> list[Pair]:
+    """Count the successes of every pair of axes among results, over the trials with all four combinations.
 
     Raises:
-        PipelineError: when they are of several policies or settings, or have no complete trial.
+        PipelineError: if the results have several policies or settings, or if no trial is complete.
     """
-    of_pairs = [(row, files) for row, files in found if row.source in ("libero", "own") and row.reason != REFUSED]
+    of_pairs = [(row, files) for row, files in results if row.source in ("libero", "own") and row.reason != REFUSED]
     one_setting(of_pairs)
     refuse_different(of_pairs)
-    listed = [row for row, _ in of_pairs]
+    rows = [row for row, _ in of_pairs]
     # The combinations of a trial share suite, LIBERO task and number of the initial state.
-    drawn = {(row.axis, row.level, (row.suite, row.base, row.number)): row for row in listed}
-    axes = _in_order(axis for joined, _, _ in drawn if joined != "clean" for axis in joined.split("+"))
-    counted = [pair for one, other in combinations(axes, 2) if (pair := _pair(one, other, drawn)) is not None]
+    combined = {(row.axis, row.level, (row.suite, row.base, row.number)): row for row in rows}
+    perturbed_axes: list[str] = []
+    for axis, _, _ in combined:
+        if axis != "clean":
+            perturbed_axes += axis.split("+")
+    counted: list[Pair] = []
+    for first_axis, second_axis in combinations(_in_order(perturbed_axes), 2):
+        pair = _pair(first_axis, second_axis, combined)
+        if pair is not None:
+            counted.append(pair)
     if not counted:
         raise PipelineError(
             "no trial has all four combinations of two axes, the pair with the draws of its singles",
@@ -131,55 +156,82 @@ def pairs(found: Iterable[Stored]) -> list[Pair]:
     return counted
 
 
-def _pair(one: str, other: str, drawn: Mapping[tuple[str, int, tuple[str, str, int]], EpisodeResult]) -> Pair | None:
-    """Two axes' trials counted; None where there is none. What has one initial state, at whichever level, is drawn
-    together. A pair that does not have the draws of its singles is left out."""
+def _pair(
+    first_axis: str, second_axis: str, combined: Mapping[tuple[str, int, tuple[str, str, int]], EpisodeResult]
+) -> Pair | None:
+    """Count the trials of two axes; return `None` if there are no trials.
+
+    The bootstrap resamples all trials of one initial state together, across levels. A trial is left out if its pair
+    does not have the perturbations of its single axes.
+
+    Args:
+        combined: axis (or joined axes), level and initial state to the result.
+    """
+    joined_axes = f"{first_axis}+{second_axis}"
     starts, outcomes = [], []
-    for axis, level, start in drawn:
-        four = (("clean", 0, start), (one, level, start), (other, level, start), (f"{one}+{other}", level, start))
-        if axis == f"{one}+{other}" and drawn.keys() >= {*four}:
-            _, first, second, joined = rows = [drawn[combination] for combination in four]
-            if joined.perturbations == [*first.perturbations, *second.perturbations]:
-                starts.append(start)
-                outcomes.append([row.success for row in rows])
+    for axis, level, start in combined:
+        if axis != joined_axes:
+            continue
+        four = (
+            ("clean", 0, start),
+            (first_axis, level, start),
+            (second_axis, level, start),
+            (joined_axes, level, start),
+        )
+        if not combined.keys() >= {*four}:
+            continue
+        rows = [combined[combination] for combination in four]
+        _, first, second, joined = rows
+        if joined.perturbations == [*first.perturbations, *second.perturbations]:
+            starts.append(start)
+            outcomes.append([row.success for row in rows])
     if not starts:
         return None
     measured = interval([start[:2] for start in starts], starts, np.array(outcomes), gap)
-    neither, only_one, only_other, both = np.sum(outcomes, axis=0).tolist()
-    return Pair(one, other, len(starts), neither, only_one, only_other, both, measured)
+    neither, only_first, only_second, both = np.sum(outcomes, axis=0).tolist()
+    return Pair(first_axis, second_axis, len(starts), neither, only_first, only_second, both, measured)
 
 
 def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    """Replace NaN and infinity by `None`."""
     return {name: number if np.isfinite(number) else None for name, number in numbers.items()}
 
 
 def _in_order(axes: Iterable[str]) -> list[str]:
-    """None twice, in the order in which they apply."""
+    """List axes without duplicates, in the order in which their perturbations apply."""
     once = dict.fromkeys(axes)
     return list(axes_of("+".join(once))) if once else []
 
 
 def matrix(measured: Sequence[Pair]) -> tuple[list[str], Floats]:
-    """The axes (N), and (N, N) the products of the two marginal probabilities above the diagonal, the joint
-    probabilities below it, NaN where a pair was not measured."""
-    names = _in_order(axis for pair in measured for axis in (pair.one, pair.other))
-    shown = np.full((len(names), len(names)), np.nan)
+    """Return the N axes, and an (N, N) matrix of probabilities.
+
+    The matrix has the product of the two marginal probabilities above the diagonal and the joint probability below it.
+    Entries of pairs that were not measured are NaN.
+    """
+    axes: list[str] = []
+    for pair in measured:
+        axes += [pair.one, pair.other]
+    names = _in_order(axes)
+    probabilities = np.full((len(names), len(names)), np.nan)
     for pair in measured:
         row, column = names.index(pair.one), names.index(pair.other)
-        shown[row, column], shown[column, row] = pair.product, pair.joint
-    return names, shown
+        probabilities[row, column], probabilities[column, row] = pair.product, pair.joint
+    return names, probabilities
 
 
 def heatmap(measured: Sequence[Pair], file: Path) -> None:
-    """Plot the matrix as the paper does."""
-    names, shown = matrix(measured)
+    """Plot the matrix of ``matrix`` as a heat map, in the paper's layout, and save it as a PNG file."""
+    names, probabilities = matrix(measured)
     figure = Figure(figsize=(1.6 + 0.9 * len(names), 1.2 + 0.8 * len(names)), layout="constrained")
     axes = figure.add_subplot()
-    image = axes.imshow(shown, cmap="viridis")
-    middle = (np.nanmin(shown) + np.nanmax(shown)) / 2 if np.isfinite(shown).any() else 0.0
-    for row, column in np.argwhere(np.isfinite(shown)):
-        colour = "black" if shown[row, column] > middle else "white"
-        axes.text(column, row, f"{shown[row, column]:.3f}", ha="center", va="center", color=colour)
+    image = axes.imshow(probabilities, cmap="viridis")
+    measured_any = np.isfinite(probabilities).any()
+    middle = (np.nanmin(probabilities) + np.nanmax(probabilities)) / 2 if measured_any else 0.0
+    for row, column in np.argwhere(np.isfinite(probabilities)):
+        probability = probabilities[row, column]
+        colour = "black" if probability > middle else "white"
+        axes.text(column, row, f"{probability:.3f}", ha="center", va="center", color=colour)
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.set_title("above: p(i | success) p(j | success)\nbelow: p(i, j | success)", fontsize=10)

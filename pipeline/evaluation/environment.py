@@ -1,7 +1,7 @@
-"""One interface to every task: start an episode, look, act."""
+"""Interface to the tasks of all sources: start an episode, observe, act."""
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -29,57 +29,61 @@ from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
 
 LEROBOT_SPATIAL = 280
-"""lerobot's limit of ``libero_spatial``; its others are those of OpenVLA (``lerobot/envs/libero.py``, 0.6.1)."""
+"""lerobot's step limit of ``libero_spatial``; its other limits equal OpenVLA's (``lerobot/envs/libero.py``, 0.6.1)."""
 
 
 class EpisodeSettings(Frozen, use_attribute_docstrings=True):
-    """What holds for all episodes of an evaluation."""
+    """Settings of all episodes of an evaluation."""
 
     prompt: Prompt = "clean"
-    """wording of test tasks: LIBERO's instruction, or as the benchmark's code has it, the file's name; ``blank`` says
-    nothing in any task"""
+    """wording of test tasks: LIBERO's instruction, or the file's name as in the benchmark's code; ``blank`` gives an
+    empty instruction in every task"""
     seed: int = 0
-    """of held-out perturbations and of noise that is random"""
+    """seed of held-out perturbations and of random noise"""
     fixture_seed: int = 0
-    """of LIBERO's reset, to which the number of the initial state is added; 0 is what OpenVLA uses"""
+    """seed of LIBERO's reset, to which the number of the initial state is added; OpenVLA uses 0"""
     initial_states: Literal["libero", "demonstration"] = "libero"
-    """those that LIBERO evaluates from, or the one that the starter set's demonstration of the task begins in, one
-    episode a task; test tasks have a state of their own, and goals begin in LIBERO's"""
-    # What came later is left out where it is not used, so that results keep their names.
+    """LIBERO's initial states for evaluation, or the first state of the starter set's demonstration, one episode per
+    task; test tasks have their own state, and goals begin in LIBERO's states"""
+    # Fields that were added later are left out of an episode's name if they have their default: names stay equal.
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
-    """which views are black, to see what a policy does without them"""
+    """views that are black, to test a policy without them"""
     plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
-    """which held-out perturbations keep clear of: what is closer than its axis allows is sampled again. Results name it
-    by the SHA-256 of its file."""
+    """training plan: held-out perturbations that are closer to it than their axis's clearance are sampled again.
+    Results name the plan by the SHA-256 of its file."""
     look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
-    """a server that keeps its chunk of actions to itself takes so many of each: it is shown the scene once in so many
-    control steps"""
-    step_limits: Literal["openvla", "lerobot"] = Field(default="openvla", exclude_if=lambda whose: whose == "openvla")
-    """whose: they differ in libero_spatial, 220 (openvla) and 280 (lerobot)"""
-    runner: Literal["pipeline", "lerobot-eval"] = Field(default="pipeline", exclude_if=lambda one: one == "pipeline")
-    """what asks the policy: lerobot-eval has its own batches and random numbers, so what one policy does there and in
-    ``evaluate`` need not be the same"""
+    """number of control steps between two observations of a server that keeps its chunks: the number of actions that
+    the server takes from each chunk"""
+    step_limits: Literal["openvla", "lerobot"] = Field(default="openvla", exclude_if=lambda limits: limits == "openvla")
+    """source of the step limits: they differ in libero_spatial, 220 (openvla) and 280 (lerobot)"""
+    runner: Literal["pipeline", "lerobot-eval"] = Field(default="pipeline", exclude_if=lambda name: name == "pipeline")
+    """program that runs the policy: lerobot-eval has its own batches and random numbers, so a policy may act
+    differently there than in ``evaluate``"""
 
     def step_limit(self, suite: str) -> int:
-        """Of an episode in a suite."""
+        """Return the step limit of an episode in a suite."""
         lerobots = self.step_limits == "lerobot" and suite == "libero_spatial"
         return LEROBOT_SPATIAL if lerobots else STEP_LIMITS[suite]
 
     @field_serializer("plan")
     def _name_by_content(self, plan: Path) -> str:
+        """Serialise the plan as the SHA-256 of its file."""
         return own_draws.sha256_of(plan)
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where an episode stands.
+    """Progress of an episode.
 
     Attributes:
-        steps: actions taken, without the settling steps.
-        reason: ``running``, ``not_begun``, or why it is over: ``success``, ``step_limit``, ``simulation_unstable``, a
-            failure also where LIBERO's or the benchmark's own scene does not settle, or ``refused`` where the scene
-            does not take a held-out perturbation. Such an episode is over before its first look and says nothing of a
-            policy.
+        steps: number of actions taken, without the settling steps.
+        reason: ``running``, ``not_begun``, or the reason why the episode is over.
+
+            * ``success`` and ``step_limit``.
+            * ``simulation_unstable`` is a failure. The same holds if LIBERO's or the benchmark's own scene does not
+              settle.
+            * ``refused`` means that the scene does not accept a held-out perturbation. Such an episode is over before
+              its first observation and is no evidence about a policy.
     """
 
     steps: int = 0
@@ -87,17 +91,20 @@ class Progress:
 
     @property
     def success(self) -> bool:
+        """Return whether the episode reached its goal."""
         return self.reason == "success"
 
     @property
     def over(self) -> bool:
+        """Return whether the episode is not running, also before it begins."""
         return self.reason != "running"
 
 
 class EpisodeEnvironment:
-    """Runs episodes one after the other; keep one for many, ordered by task: what is built for a scene is reused.
+    """Environment that runs episodes one after the other.
 
-    Frames are rendered when they are asked for, and only then; ``looks`` counts observations.
+    Use one environment for many episodes, ordered by task, because it reuses the simulator of a scene. Frames are
+    rendered only on request; ``looks`` counts observations.
 
     Args:
         archive: folder of LIBERO-Plus's asset archive, for test tasks of light, background and layout.
@@ -110,10 +117,12 @@ class EpisodeEnvironment:
         self._picture = Picture()
 
     def reset(self, task: EvaluationTask) -> Progress:
-        """Start an episode: LIBERO's reset, the initial state, ten settling steps; over where the scene is refused.
+        """Start an episode: LIBERO's reset, the initial state, ten settling steps.
+
+        The episode is over at once if the scene is rejected.
 
         Raises:
-            PipelineError: when the task cannot be rebuilt here.
+            PipelineError: if the task cannot be rebuilt on this machine.
         """
         self._picture.restore()
         self.progress = Progress()
@@ -136,10 +145,10 @@ class EpisodeEnvironment:
 
         Args:
             action: (7,) deltas of position and axis-angle in [-1, 1], which the controller clips, and the gripper:
-                below 0 opens, else closes.
+                a number below 0 opens it, other numbers close it.
 
         Raises:
-            PipelineError: when the action is not seven finite numbers, or no episode is running.
+            PipelineError: if the action is not seven finite numbers, or if no episode is running.
         """
         given, *others = checked_actions(action, "action").copy()
         if others:
@@ -159,13 +168,16 @@ class EpisodeEnvironment:
 
     @property
     def instruction(self) -> str:
-        """What the policy is told."""
+        """Return the instruction that the policy gets."""
         if self.task.source == "libero_plus":
             return libero_plus.instruction(self._test, self.settings.prompt)
         return "" if self.settings.prompt == "blank" else self._base.instruction
 
     def image(self, view: str) -> Frame:
-        """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
+        """Return the (256, 256, 3) uint8 RGB image of ``agentview`` or ``wrist``.
+
+        The image is turned by 180 degrees, as policies expect it.
+        """
         if view not in self._seen:
             if self.settings.black in (view, "all"):
                 self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8)
@@ -174,25 +186,30 @@ class EpisodeEnvironment:
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
-        """What a policy sees, as vla-eval names it: ``images``, ``states`` (8,) and ``task_description``."""
-        views = () if not wanted.images else VIEWS if wanted.wrist else ("agentview",)
+        """Return the observation of a policy in vla-eval's names: ``images``, ``states`` (8,), ``task_description``."""
+        views: Iterable[str] = ()
+        if wanted.images:
+            views = VIEWS if wanted.wrist else ("agentview",)
         self.looks += 1
         images = {view: self.image(view) for view in views}
-        seen: dict[str, Any] = {"images": images, "task_description": self.instruction}
+        observation: dict[str, Any] = {"images": images, "task_description": self.instruction}
         if wanted.state:
-            seen["states"] = self.simulator.observed.state.copy()
-            angle_rad = float(np.linalg.norm(seen["states"][3:6]))
+            state = self.simulator.observed.state.copy()
+            angle_rad = float(np.linalg.norm(state[3:6]))
             if wanted.shortest_rotation and angle_rad > np.pi:
-                seen["states"][3:6] *= (angle_rad - 2 * np.pi) / angle_rad
-        return seen
+                state[3:6] *= (angle_rad - 2 * np.pi) / angle_rad
+            observation["states"] = state
+        return observation
 
     def close(self) -> None:
+        """Close the renderer and the simulator."""
         self._picture.close()
         if self._key:
             self.simulator.close()
         self._key = ()
 
     def _start_test_task(self) -> None:
+        """Start an episode of a test task of LIBERO-Plus."""
         test = self._test
         posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
         state = libero_states(self._base)[0]
@@ -212,12 +229,14 @@ class EpisodeEnvironment:
         self._start(self.settings.fixture_seed, state, posture)
 
     def _start_goal(self) -> None:
+        """Start an episode of a LIBERO task with a replaced goal object."""
         replacement = find_replacement(self._base, self.task.name)
         self._build_from(replacement.bddl_text(self._base), f"{replacement.old} {replacement.new}")
         self._base = replace(self._base, instruction=replacement.instruction)
         self._start(*self._initial_state())
 
     def _start_libero(self) -> None:
+        """Start an episode of a LIBERO task, with held-out perturbations if the task has any."""
         self._build(self._base)
         seed, demo, recorded = self.settings.fixture_seed, StarterSource().of(self._base), True
         if self.settings.initial_states == "libero":
@@ -225,9 +244,10 @@ class EpisodeEnvironment:
             demo, recorded = replace(demo, init_state=state), False
 
         def nominal() -> Scene:
+            """Return the scene without perturbations."""
             scene = recorded_start(demo, self.simulator.place_fixtures(seed))
-            # A recording had the gripper open; LIBERO's reset, after which its own states are put in, leaves it without
-            # a command.
+            # A recording begins with an open gripper. LIBERO restores its own states after its reset, which leaves the
+            # gripper without a command.
             return scene if recorded else replace(scene, gripper=0.0)
 
         scene = None
@@ -250,15 +270,22 @@ class EpisodeEnvironment:
         self._picture.show(self.simulator.model, self.perturbations)
 
     def _initial_state(self) -> tuple[int, Floats]:
+        """Return the seed of LIBERO's reset and LIBERO's initial state for this task."""
         states = libero_states(self._base)
         number = self.task.number % len(states)
         return self.settings.fixture_seed + number, states[number]
 
     @property
     def _test(self) -> TestTask:
+        """Return the benchmark's test task of this episode."""
         return benchmark.load().find(self.task.suite, self.task.name)
 
     def _assets(self, test: TestTask) -> Path:
+        """Return the folder with the files that a test task needs.
+
+        Raises:
+            PipelineError: if neither LIBERO's assets nor the archive have the files.
+        """
         assets = libero_plus.assets_of(test, self._archive)
         if assets is None:
             raise PipelineError(
@@ -270,12 +297,14 @@ class EpisodeEnvironment:
         return assets
 
     def _build_from(self, bddl_text: str, scene: str) -> None:
+        """Build the simulator of the task from another BDDL text."""
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / self._base.bddl_file.name
             file.write_text(bddl_text)
             self._build(replace(self._base, bddl_file=file), scene)
 
     def _build(self, task: Task, scene: str = "", files: SceneFiles | None = None) -> None:
+        """Build the simulator of a task, unless the current simulator has the same scene."""
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()

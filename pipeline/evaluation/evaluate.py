@@ -1,4 +1,4 @@
-"""A whole evaluation: tasks over worker processes, a file for each episode, and a summary."""
+"""Complete evaluation: tasks run in worker processes, with one file per episode and a summary."""
 
 import atexit
 import ctypes
@@ -29,70 +29,73 @@ from pipeline.images.mp4 import mp4
 from pipeline.types import Frame
 
 EPISODES_A_JOB = 10
-"""At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
+"""Largest number of episodes in a job. Smaller jobs spread better over workers; larger jobs build fewer scenes."""
 
 JOBS_A_WORKER = 4
-"""With few episodes, jobs are made smaller until there are so many, or one worker would end long after the others."""
+"""Number of jobs per worker below which jobs get smaller, so that all workers end at a similar time."""
 
 SCENE_AXES = ("pose", "layout", "light", "background")
-"""The axes whose test tasks have a scene each."""
+"""Axes whose test tasks each have their own scene."""
 
 FAILURES_IN_A_ROW = 3
-"""After so many episodes in a row without an action from the policy a worker stops the evaluation."""
+"""Number of consecutive episodes without an action from the policy after which a worker stops the evaluation."""
 
 FAULTS_NAMED = 3
-"""So many episodes without a result are named in the message that counts them."""
+"""Number of episodes without a result that are named in the error message."""
 
 SCENE_S, STEP_S = 1800.0, 120.0
-"""No scene takes so long to build, and no step with its answer takes so long, on any machine."""
+"""Upper bounds, for any machine, on the time to build a scene and on the time of a step with the policy's answer."""
 
 
 def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers: int = 1) -> dict[str, Any]:
-    """Run what the folder does not hold yet, and write ``summary.json`` of what was selected.
+    """Run the selected episodes that have no result yet, and write ``summary.json`` of all selected episodes.
 
-    An episode in which the policy gives no action has no result, and the others are run.
+    If the policy gives no action, its episode has no result, and the evaluation resumes with the next episode.
 
     Args:
-        workers: how many share the work. Results do not depend on it.
+        workers: number of workers that share the episodes. Results do not depend on it.
 
     Returns:
         The summary.
 
     Raises:
-        PipelineError: after the summary was written, when an episode has no result; before, when the policy fails in
-            one episode after the other.
+        PipelineError: if an episode has no result; the summary is written before. If the policy fails in
+            ``FAILURES_IN_A_ROW`` consecutive episodes, no summary is written.
     """
     settings, policy = evaluation.settings, evaluation.policy
     if settings.look_every != 1 and policy.kind != "server":
         raise PipelineError(
             f"only a server is shown one observation in {settings.look_every}", where="look_every", expected="--server"
         )
-    wanted = select(selection, evaluation.archive)
-    check_settings(selection, wanted, settings)
-    evaluation.check(wanted)
+    selected = select(selection, evaluation.archive)
+    check_settings(selection, selected, settings)
+    evaluation.check(selected)
     faults: dict[EvaluationTask, str] = {}
-    if missing := [task for task in wanted if evaluation.result(task) is None]:
+    missing = [task for task in selected if evaluation.result(task) is None]
+    if missing:
         device = gl.choose().device
         jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _jobs(missing, workers)]
         work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)
-        faults = {task: what for of_job in run(work, jobs, "evaluate, episodes") for task, what in of_job.items()}
-    results = {task: evaluation.result(task) for task in wanted}
+        for job_faults in run(work, jobs, "evaluate, episodes"):
+            faults |= job_faults
+    results = {task: evaluation.result(task) for task in selected}
     rows = [row for row in results.values() if row is not None]
-    left = [task for task, row in results.items() if row is None]
-    faults |= {task: "the plan or the archive changed while it ran" for task in left if task not in faults}
-    found = summary(rows) | {
+    without_result = [task for task, row in results.items() if row is None]
+    changed = "the plan or the archive changed while it ran"
+    faults |= {task: changed for task in without_result if task not in faults}
+    summarised = summary(rows) | {
         "policy": {"name": policy.name(evaluation.identity), "identity": evaluation.identity},
         "selection": selection.model_dump(mode="json"),
         "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
     }
-    write_json(evaluation.folder / "summary.json", found)
+    write_json(evaluation.folder / "summary.json", summarised)
     if faults:
         raise _without_result([*faults.items()])
-    return found
+    return summarised
 
 
 def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
-    """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
+    """Divide tasks into jobs of one scene each, in which the tasks of one posture of the arm follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
         own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
@@ -102,21 +105,24 @@ def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[Evaluat
         scene.sort(key=lambda task: (task.axis == "robot", task.number, task.name))
     spread = len(missing) if workers == 1 else max(1, len(missing) // (workers * JOBS_A_WORKER))
     size = min(spread, EPISODES_A_JOB)
-    return [tuple(scene[at : at + size]) for scene in scenes.values() for at in range(0, len(scene), size)]
+    jobs: list[tuple[EvaluationTask, ...]] = []
+    for scene in scenes.values():
+        jobs += [tuple(scene[start : start + size]) for start in range(0, len(scene), size)]
+    return jobs
 
 
 def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], settings: EpisodeSettings) -> None:
-    """Have no episode that says a setting which it does not have, and none that is another one again.
+    """Reject settings that do not apply to the selected tasks, and settings that would duplicate episodes.
 
     Args:
-        wanted: the tasks that the selection names.
+        wanted: the selected tasks.
 
     Raises:
-        PipelineError: when one would, or the plan cannot be read.
+        PipelineError: if a setting is rejected, or if the plan cannot be read.
     """
     if settings.seed != selection.seed:
         raise PipelineError(
-            f"tasks are drawn under seed {selection.seed}, what perturbs them under {settings.seed}",
+            f"task selection uses seed {selection.seed}, but perturbations use seed {settings.seed}",
             where="seed",
             expected="one seed for both",
         )
@@ -124,7 +130,7 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
         own_draws.sha256_of(settings.plan)
         if not any(task.source == "own" for task in wanted):
             raise PipelineError(
-                "no task has held-out perturbations to keep clear of a plan", where="plan", expected="--source own"
+                "no task has held-out perturbations to compare with a plan", where="plan", expected="--source own"
             )
     if settings.prompt == "benchmark" and not any(task.source == "libero_plus" for task in wanted):
         raise PipelineError(
@@ -137,17 +143,20 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
             expected="openvla",
         )
     if settings.initial_states == "demonstration":
-        if others := {task.source for task in wanted} & {"libero_plus", "goals"}:
+        unsupported = {task.source for task in wanted} & {"libero_plus", "goals"}
+        if unsupported:
             raise PipelineError(
-                f"tasks of {' and '.join(sorted(others))} never start where a demonstration does",
+                f"tasks of {' and '.join(sorted(unsupported))} never start where a demonstration does",
                 where="initial_states",
                 expected="tasks of libero and own",
                 remedy="leave --initial-states out",
             )
         starts = Counter(f"{task.suite}/{task.base}" for task in wanted if task.source == "libero")
-        if more := [name for name, count in starts.items() if count > 1]:
+        repeated = [name for name, count in starts.items() if count > 1]
+        if repeated:
+            name = repeated[0]
             raise PipelineError(
-                f"{starts[more[0]]} episodes of {more[0]} would be the same: there is one demonstration of it",
+                f"{starts[name]} episodes of {name} would be the same: there is one demonstration of it",
                 where="initial_states",
                 expected="one episode of each task of libero",
                 remedy="--episodes 1, or leave --initial-states out",
@@ -156,10 +165,10 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
 
 @dataclass(frozen=True)
 class EvaluationJob:
-    """Some episodes of one scene, as they are sent to a worker.
+    """Job for a worker: episodes of one scene.
 
     Attributes:
-        device: what renders the evaluation, as OpenGL names it.
+        device: the device that renders the evaluation, by its OpenGL name.
     """
 
     evaluation: Evaluation
@@ -167,13 +176,14 @@ class EvaluationJob:
     device: str
 
     def __call__(self) -> dict[EvaluationTask, str]:
-        """Run the episodes, and write each one's file when it is over.
+        """Run the episodes, and write the file of each episode when it is over.
 
         Returns:
-            What was wrong with the policy, for each episode that has no result because of that.
+            Task to the policy's fault, for each episode that has no result because of the policy.
 
         Raises:
-            PipelineError: when that happens ``FAILURES_IN_A_ROW`` times.
+            PipelineError: if the policy fails in ``FAILURES_IN_A_ROW`` consecutive episodes, or if this worker renders
+                with another device.
         """
         device = gl.choose().device
         if device != self.device:
@@ -185,7 +195,7 @@ class EvaluationJob:
         environment = _environment(settings, archive)
         policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every)
         faults = {}
-        # A worker that was lost may have left some.
+        # A lost worker may have finished some episodes of this job.
         for task in self._missing():
             try:
                 self._run(task, environment, policy)
@@ -201,53 +211,62 @@ class EvaluationJob:
         return faults
 
     def episodes(self) -> int:
+        """Return the number of episodes of the job."""
         return len(self.tasks)
 
     def limit_s(self) -> float:
-        """So long it may take before it counts as hanging: far above what scenes and answers take."""
+        """Return the time after which the job counts as hanging, far above the time of scenes and answers."""
         step_s = max(STEP_S, self.evaluation.policy.timeout_s)
         return sum(SCENE_S + step_s * self.evaluation.settings.step_limit(task.suite) for task in self.tasks)
 
     def lost(self) -> dict[EvaluationTask, str]:
-        """What to say of its episodes where no worker survives it."""
+        """Return the fault of each unfinished episode if no worker survives the job."""
         return dict.fromkeys(self._missing(), LOST)
 
     def _missing(self) -> list[EvaluationTask]:
+        """List the tasks that have no result."""
         return [task for task in self.tasks if self.evaluation.result(task) is None]
 
     def _run(self, task: EvaluationTask, environment: EpisodeEnvironment, policy: Policy) -> None:
+        """Run one episode, and write its video and its result."""
         evaluation = self.evaluation
         film: dict[int, Frame] | None = None if evaluation.videos == "none" else {}
         roll_out_policy(environment, policy, task, film)
         progress = environment.progress
         if film is not None and progress.steps and (evaluation.videos == "all" or not progress.success):
-            # The policy did not look at how it ended, which is what one wants to see of a failure.
+            # The policy did not observe the end of the episode, but a viewer wants to see how it failed.
             film[progress.steps] = environment.image("agentview")
-            # Before the episode's own file: where that exists, nothing is missing.
+            # The video comes before the result: an episode with a result is complete.
             write(evaluation.files.video(evaluation.episode(task)), mp4(list(film.values()), list(film)))
         evaluation.save(environment, policy.wanted)
 
 
 @lru_cache(maxsize=1)
 def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvironment:
+    """Return this process's environment, which stays open until the process ends."""
     environment = EpisodeEnvironment(settings, archive)
     if threading.current_thread() is threading.main_thread():
-        # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
+        # Python calls exit handlers in reverse order. The first OpenGL context registers a handler that ends OpenGL, so
+        # the context is created before the environment's handler is registered.
         gl.prepare()
         mujoco.gl_context.GLContext(1, 1).free()
         atexit.register(environment.close)
     else:
-        # Only the thread that rendered may close it, and that of a worker is gone when its process ends: one reference
-        # more keeps Python from trying.
+        # Only the thread that rendered may close the environment. A worker's thread is gone when its process ends, so
+        # an extra reference keeps Python from closing the environment.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(environment))
     return environment
 
 
 @lru_cache(maxsize=1)
 def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
-    """This process's policy, which is refused if it is not the one that the evaluation was begun with."""
+    """Return this process's policy.
+
+    Raises:
+        PipelineError: if it is not the policy with which the evaluation began.
+    """
     policy = config.open(look_every)
-    # After it was loaded: files that were others before are others now.
+    # The identity is computed after loading: files that changed before they were loaded still differ now.
     if config.identity() != identity:
         raise PipelineError(
             "the checkpoint has changed since the evaluation began",
@@ -259,10 +278,11 @@ def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
 
 
 _failures: list[tuple[EvaluationTask, str]] = []
-"""Of this process's policy, since the last episode that it finished."""
+"""Failures of this process's policy since its last finished episode."""
 
 
 def _without_result(faults: Sequence[tuple[EvaluationTask, str]]) -> PipelineError:
+    """Return an error that counts the episodes without a result and names the first of them."""
     named = [f"{what} ({task})" for task, what in faults[:FAULTS_NAMED]]
     more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
     return PipelineError(

@@ -1,4 +1,4 @@
-"""The tasks as an environment of Gymnasium, which observes and acts as lerobot 0.6's own LIBERO environment does."""
+"""Gymnasium environment of the tasks, with the observations and actions of lerobot 0.6's own LIBERO environment."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,15 +18,20 @@ from pipeline.images.jpeg import resized
 from pipeline.types import Frame
 
 CAMERAS = {"image": "agentview", "image2": "wrist"}
-"""What lerobot calls the views."""
+"""lerobot's name of a view to this project's name."""
 
 Observation = dict[str, Any]
 
 
 def observation_space(size_px: tuple[int, int]) -> spaces.Dict:
-    """Args: size_px: height and width of the views."""
+    """Return the observation space.
+
+    Args:
+        size_px: height and width of the views.
+    """
 
     def numbers(*shape: int) -> spaces.Box:
+        """Return the space of unbounded numbers of a shape."""
         return spaces.Box(-np.inf, np.inf, shape, np.float64)
 
     image = spaces.Box(0, 255, (*size_px, 3), np.uint8)
@@ -38,14 +43,17 @@ def observation_space(size_px: tuple[int, int]) -> spaces.Dict:
 
 
 class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
-    """One of several environments that share a list of episodes: of ``stride`` it runs every ``stride``-th.
+    """Environment that shares a list of episodes with other environments and runs every ``stride``-th episode.
 
-    A task has its own start, so the seed of ``reset`` decides nothing.
+    A task has its own start, so the seed of ``reset`` has no effect.
 
     Args:
         tasks: all episodes, in order.
+        first: index of this environment's first episode.
+        stride: number of environments that share the list.
         size_px: height and width of the views; they are rendered in 256 x 256 and resized.
-        evaluation: where the rows of episodes go, if anywhere.
+        evaluation: evaluation that stores the rows of episodes; `None` stores no rows.
+        archive: folder of LIBERO-Plus's asset archive.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -70,23 +78,25 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
 
     @property
     def task(self) -> str:
+        """Return the name of the current task."""
         return self._environment.task.name
 
     @property
     def task_description(self) -> str:
-        """What the policy is told."""
+        """Return the instruction that the policy gets."""
         return self._environment.instruction
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Any]:
         """Start the next episode.
 
-        Where the episodes do not fill the last round, some environments run one again, which has no row.
+        If the episodes do not fill the last round, some environments repeat an episode. A repetition has no row.
 
         Raises:
-            PipelineError: when there is no episode left in any environment.
+            PipelineError: if no environment has an episode left, or if the scene rejects the perturbation.
         """
         super().reset(seed=seed)
-        if self._round * self._stride >= (count := len(self._tasks)):
+        count = len(self._tasks)
+        if self._round * self._stride >= count:
             raise PipelineError(
                 f"more episodes are asked for than the {count} that were selected",
                 where="eval.n_episodes",
@@ -100,36 +110,38 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         gl.prepare()
         if self._environment.reset(task).over:
             raise PipelineError(
-                "the scene refuses what was sampled", where=str(task), remedy="name others by --env.tasks"
+                "the scene rejects the perturbation", where=str(task), remedy="name other tasks by --env.tasks"
             )
         return self._look(), {"is_success": False}
 
     def step(self, action: np.ndarray[Any, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one control step; see ``EpisodeEnvironment``."""
         progress = self._environment.step(action)
-        seen = self._look()
+        observation = self._look()
         limited = progress.reason == "step_limit"
         if progress.over and self._evaluation is not None and not self._again:
             self._evaluation.save(self._environment, Wanted())
         done = {"done": progress.over, "is_success": progress.success, "task": self.task}
-        return seen, float(progress.success), progress.over and not limited, limited, done
+        return observation, float(progress.success), progress.over and not limited, limited, done
 
     def render(self) -> Frame:
-        """(256, 256, 3) the agent view, upright."""
+        """Return the (256, 256, 3) agent view, upright."""
         return self._environment.image("agentview")
 
     def close(self) -> None:
+        """Close the environment."""
         self._environment.close()
 
     def _look(self) -> Observation:
-        """LIBERO's views as they are rendered, upside down, which lerobot's processor turns."""
+        """Return the observation; views are upside down as LIBERO renders them, and lerobot's processor turns them."""
         self._environment.looks += 1
         simulator = self._environment.simulator
         observed = simulator.observed
-        turned = {name: resized(self._environment.image(view), *self._size_px) for name, view in CAMERAS.items()}
+        upright = {name: resized(self._environment.image(view), *self._size_px) for name, view in CAMERAS.items()}
+        upside_down = {name: np.ascontiguousarray(frame[::-1, ::-1]) for name, frame in upright.items()}
         w, *xyz = observed.hand_wxyz
         return {
-            "pixels": {name: np.ascontiguousarray(frame[::-1, ::-1]) for name, frame in turned.items()},
+            "pixels": upside_down,
             "robot_state": {
                 "eef": {
                     "pos": observed.state[:3].astype(np.float64),

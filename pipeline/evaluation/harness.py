@@ -1,5 +1,7 @@
-"""The tasks as a benchmark of vla-eval, the field's harness: ``vla-eval run`` with a configuration that names
-``pipeline.evaluation.harness:PerturbedLibero`` evaluates any of its model servers.
+"""Benchmark for vla-eval, the field's harness.
+
+``vla-eval run`` evaluates any of vla-eval's model servers on the tasks. Its configuration names
+``pipeline.evaluation.harness:PerturbedLibero``.
 """
 
 from pathlib import Path
@@ -33,31 +35,33 @@ ACTION = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPE
 
 
 class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
-    """LIBERO's tasks, LIBERO-Plus's test tasks, or held-out perturbations, as a ``Selection`` chooses them.
+    """Benchmark of LIBERO's tasks, LIBERO-Plus's test tasks, or held-out perturbations, chosen by a ``Selection``.
 
-    ``episodes_per_task`` of the harness stays 1: each initial state and each draw is a task of its own here, and
-    ``selection.episodes`` says how many.
+    ``episodes_per_task`` of the harness stays 1. Each initial state and each perturbation is a separate task, and
+    ``selection.episodes`` sets their number.
 
     Args:
         selection: fields of ``Selection``, such as ``{"source": "libero_plus", "axes": ["camera"], "subset": 100}``.
         settings: fields of ``EpisodeSettings``, such as ``{"prompt": "benchmark"}``; the seed is the selection's.
-        look_every: a server that answers with one action from a chunk of its own is shown one observation in so many
-            control steps, the number of actions that it takes from a chunk; in between the last one is sent again, and
-            nothing is rendered. 1 renders every step. After a chunk that a server answers with it is always looked.
-        send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
-            names it. Its model servers set these.
-        absolute_action: as there; refused.
-        env_seed: as there, of LIBERO's reset.
-        out, label: folder for the rows of the policy of that name, as ``evaluate`` writes them; none by default.
+        look_every: number of control steps between two observations of a server that answers with single actions from
+            a chunk of its own: the number of actions that it takes from a chunk. In between, the last observation is
+            sent again and nothing is rendered. 1 renders every step. After an answer that is a chunk, a new observation
+            is always rendered.
+        send_wrist_image, send_state, quat_no_antipodal: content of the observation, in the names of vla-eval's own
+            LIBERO benchmark. vla-eval's model servers set these arguments.
+        absolute_action: argument of vla-eval's LIBERO benchmark; rejected here.
+        env_seed: argument of vla-eval's LIBERO benchmark: seed of LIBERO's reset.
+        out, label: folder for the rows of the policy, in the format of ``evaluate``, and the policy's name there; by
+            default no rows are written.
         assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
-        seed: as there; without an effect, since nothing here uses a global generator.
+        seed: argument of vla-eval's LIBERO benchmark; without effect, because the tasks use no global generator.
     """
 
     render_backends: ClassVar[frozenset[str]] = frozenset({"gpu", "cpu"})
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """This project picks its OpenGL itself; ``MUJOCO_GL`` is respected where it is set."""
+        """Choose OpenGL as this project does, which respects ``MUJOCO_GL`` if it is set."""
         choice = gl.choose()
         print(choice)
         return {"MUJOCO_GL": choice.backend}
@@ -91,12 +95,12 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             policy = PolicyConfig(kind="server", address="of the harness", label=label)
             self._evaluation = Evaluation(episodes, policy, policy.identity(), Path(out), archive=self._archive)
         elif label:
-            raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR beside it")
+            raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR next to it")
         self._next_look = NextLook(self._environment.settings.look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
+        """Return one task per episode; ``name`` is unique, ``suite`` is LIBERO's."""
         tasks = select(self._selection, self._archive)
         check_settings(self._selection, tasks, self._environment.settings)
         if self._evaluation is not None:
@@ -104,18 +108,23 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         return [task.for_harness() for task in tasks]
 
     def reset(self, task: dict[str, Any]) -> Any:
+        """Start an episode and return its first observation.
+
+        Raises:
+            PipelineError: if the scene rejects the perturbation.
+        """
         progress = self._environment.reset(EvaluationTask.of_harness(task))
         if progress.over:
             self._save()
-            raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
+            raise PipelineError("the scene rejects the perturbation", where=task["name"], remedy="leave this task out")
         self._next_look.left = 0
         return self._look()
 
     def step(self, action: dict[str, Any]) -> StepResult:
         """Take one action (7,), or all of a chunk (n, 7) until the episode is over."""
         given = action.get("actions", action.get("action"))
-        for one in checked_actions(given, "model server"):
-            progress = self._environment.step(one)
+        for single_action in checked_actions(given, "model server"):
+            progress = self._environment.step(single_action)
             if progress.over:
                 break
         self._next_look.answered(given)
@@ -124,9 +133,15 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         return StepResult(self._last, float(progress.success), progress.over, {"success": progress.success})
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation as the model server gets it."""
         return dict(raw_obs)
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
+        """Store the episode's row if rows are wanted, and return its result.
+
+        Raises:
+            PipelineError: if rows are wanted but the harness ended the episode before its limit.
+        """
         progress = self._environment.progress
         if self._evaluation is not None and not progress.over:
             raise PipelineError(
@@ -139,7 +154,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         return {"success": progress.success, "reason": progress.reason}
 
     def get_metadata(self) -> dict[str, Any]:
-        """``max_steps`` is the largest limit; each episode ends at that of its own suite."""
+        """Return the metadata; ``max_steps`` is the largest limit, but each episode ends at its own suite's limit."""
         return {
             "max_steps": max(self._environment.settings.step_limit(suite) for suite in self._selection.suites),
             "max_episodes_per_task": 1,
@@ -148,9 +163,11 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         }
 
     def get_action_spec(self) -> dict[str, DimSpec]:
+        """Return the format of actions."""
         return ACTION
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
+        """Return the format of observations."""
         spec = {"agentview": IMAGE_RGB, "language": LANGUAGE}
         if self._wanted.wrist:
             spec["wrist"] = IMAGE_RGB
@@ -159,22 +176,25 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         return spec
 
     def cleanup(self) -> None:
+        """Close the environment."""
         self._environment.close()
 
     def _look(self) -> dict[str, Any]:
+        """Render an observation and keep it, because it may be sent again."""
         self._last = self._environment.observation(self._wanted)
         return self._last
 
     def _save(self) -> None:
+        """Store the episode's row if rows are wanted."""
         if self._evaluation is not None:
             self._evaluation.save(self._environment, self._wanted)
 
 
 class ReplayServer(ModelServer):  # type: ignore[misc]
-    """Answers with the actions of the starter set's demonstration of the task.
+    """Model server that answers with the actions of the starter set's demonstration of the task.
 
     Args:
-        chunk: how many actions each answer has; all are taken before the next look. Of no effect when tracked.
+        chunk: number of actions in each answer; all are taken before the next observation. Without effect if tracked.
         tracked: follow the demonstration's path by the state in each observation, one action at a time.
     """
 
@@ -183,21 +203,28 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
         self._replays: dict[str, Replay | TrackedReplay] = {}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
-        replay = self._replays[ctx.session_id] = TrackedReplay() if self._tracked else Replay(self._chunk)
+        """Begin a replay of the episode's demonstration."""
+        replay: Replay | TrackedReplay = TrackedReplay() if self._tracked else Replay(self._chunk)
+        self._replays[ctx.session_id] = replay
         replay.begin(EvaluationTask.of_harness(config["task"]))
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
+        """Answer with the next actions."""
         actions = self._replays[ctx.session_id].act(lambda _: obs)
-        # A chunk of one is sent as one action (7,), but not the last action of a longer one: it keeps none.
+        # A chunk of one action is sent as a single action (7,). A longer chunk is sent as a chunk even if only one
+        # action is left, because this server keeps no actions.
         await ctx.send_action({"actions": actions.squeeze() if self._tracked or self._chunk == 1 else actions})
 
     def get_observation_params(self) -> dict[str, Any]:
+        """Return the content of the observations that this server needs."""
         return {"send_state": self._tracked}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
+        """Return the format of actions."""
         return ACTION
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
+        """Return the format of observations."""
         return {"image": IMAGE_RGB, **({"state": STATE_EEF_POS_AA_GRIP} if self._tracked else {})}
 
 

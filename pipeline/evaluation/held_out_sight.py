@@ -1,4 +1,4 @@
-"""Whether a held-out perturbation shows enough to act by: the rule by which a run drops its episodes."""
+"""The visibility rule of a run, applied to held-out perturbations: a frame must show enough for a policy to act."""
 
 from collections.abc import Sequence
 
@@ -16,18 +16,18 @@ from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
 
 
 def can_hide(perturbation: Perturbation) -> bool:
-    """Return whether a perturbation can leave too little to see: it changes the picture, or adds objects."""
+    """Return whether a perturbation can hide too much: it changes the frames, or adds objects."""
     return isinstance(perturbation, RenderPerturbation | LayoutPerturbation)
 
 
 def fault(scene: Scene, demo: Demo, perturbations: Sequence[Perturbation], opened: LastScene) -> str | None:
     """Return why a run would reject the first frame of a scene under render perturbations, else `None`.
 
-    The hand is where the demonstration's actions lead it.
+    The hand's positions come from a replay of the demonstration's actions.
 
     Args:
-        scene: with the physics perturbations among ``perturbations`` applied.
-        opened: renders it.
+        scene: scene to which the physics perturbations among ``perturbations`` have been applied.
+        opened: renderer of the scene.
     """
     states = roll_out(scene, demo)
     renderer = opened.renderer(scene.model_xml)
@@ -39,8 +39,9 @@ def fault(scene: Scene, demo: Demo, perturbations: Sequence[Perturbation], opene
     replay = Trajectory("", "open_loop", scene, states, demo.actions, site_alpha, Verdict(True, "kept"))
     first_frame = FirstFrame(renderer, replay, demo.task, np.stack(hand_m))
     streams = streams_of(to_json(perturbations)).values()
-    for changes, of_scene in grouped((stream.changes, stream) for stream in streams).items():
+    for changes, streams_with_changes in grouped((stream.changes, stream) for stream in streams).items():
         with renderer.perturbed(changes):
-            if reason := first_frame.fault(of_scene):
-                return reason
+            reason = first_frame.fault(streams_with_changes)
+        if reason:
+            return reason
     return None

@@ -1,7 +1,7 @@
-"""The tasks for ``lerobot-eval --env.discover_packages_path=pipeline.evaluation.lerobot_eval``, of lerobot 0.6.
+"""Environments for ``lerobot-eval --env.discover_packages_path=pipeline.evaluation.lerobot_eval``, of lerobot 0.6.
 
-One vector environment a suite runs all episodes that are selected of it, shared among ``--eval.batch_size``
-environments: ``--eval.n_episodes`` is their number, which is printed.
+One vector environment per suite runs the suite's selected episodes, shared among ``--eval.batch_size`` environments.
+Set ``--eval.n_episodes`` to the number of episodes, which is printed.
 """
 
 from dataclasses import dataclass, field
@@ -31,17 +31,18 @@ except ImportError as error:
         "`python -m pipeline evaluate OUT --checkpoint DIR`"
     ) from error
 
-__path__: list[str] = []  # lerobot looks for modules inside what it is told to import
+__path__: list[str] = []  # lerobot searches the imported package for modules
 
 
 @EnvConfig.register_subclass("perturbed_libero")
 @dataclass
 class PerturbedLibero(EnvConfig):  # type: ignore[misc]
-    """Tasks as a ``Selection`` chooses them, under ``EpisodeSettings``; the fields are theirs.
+    """Configuration of the environments, with the fields of ``Selection`` and ``EpisodeSettings``.
 
     Attributes:
-        task: suites, separated by commas; ``subset`` and ``episodes`` hold for each.
-        out, label: folder for the rows of the policy, as ``evaluate`` writes them, and its name there; none by default.
+        task: suites, separated by commas; ``subset`` and ``episodes`` apply to each suite.
+        out, label: folder for the rows of the policy, in the format of ``evaluate``, and the policy's name there; by
+            default no rows are written.
         assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
     """
 
@@ -71,13 +72,19 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
+        """Return no arguments, because ``create_envs`` builds the environments."""
         return {}
 
     def get_env_processors(self) -> Any:
+        """Return the processors of lerobot's own LIBERO environment."""
         return self._theirs().get_env_processors()
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """Suite to the vector environment of all its episodes, whose number is 0."""
+        """Return suite to 0 to the vector environment of all the suite's episodes.
+
+        Raises:
+            PipelineError: if a setting is rejected.
+        """
         if self.source not in ("libero", "libero_plus", "goals"):
             raise PipelineError(f"no source {self.source!r}", where="env.source", expected="libero, libero_plus, goals")
         if self.max_parallel_tasks > 1:
@@ -94,37 +101,43 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
         size_px = self.observation_height, self.observation_width
         tasks: dict[str, list[EvaluationTask]] = {}
         for suite in (self.task or "").split(","):
-            # Those of one scene after the other, so that it is built once.
             named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
             chosen = {"suites": (suite.strip(),), **{name: getattr(self, name) for name in named}}
             selection = Selection.model_validate(chosen)
+            # Sorted by scene, so that each scene is built once.
             tasks[suite.strip()] = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
-        every = [task for of_suite in tasks.values() for task in of_suite]
-        check_settings(selection, every, settings)
+        every_task: list[EvaluationTask] = []
+        for suite_tasks in tasks.values():
+            every_task += suite_tasks
+        check_settings(selection, every_task, settings)
         if evaluation is not None:
-            evaluation.check(every)
-        print(gl.choose())  # before the worker processes, which inherit it
-        found: dict[str, dict[int, gym.vector.VectorEnv]] = {}
-        for suite, of_suite in tasks.items():
-            print(f"{suite}: {len(of_suite)} episodes; --eval.n_episodes={len(of_suite)} runs each of them once")
-            made = [
-                # An environment that is done waits until the others are.
-                freeze_after_episode_end(
-                    partial(PerturbedLiberoEnv, of_suite, settings, first, n_envs, size_px, evaluation, archive)
-                )
-                for first in range(n_envs)
-            ]
-            together: Any = gym.vector.SyncVectorEnv
+            evaluation.check(every_task)
+        print(gl.choose())  # before the worker processes start, because they inherit the choice
+        vector_environments: dict[str, dict[int, gym.vector.VectorEnv]] = {}
+        for suite, suite_tasks in tasks.items():
+            count = len(suite_tasks)
+            print(f"{suite}: {count} episodes; --eval.n_episodes={count} runs each of them once")
+            makers = []
+            for first in range(n_envs):
+                maker = partial(PerturbedLiberoEnv, suite_tasks, settings, first, n_envs, size_px, evaluation, archive)
+                # An environment that is done waits until all environments are done.
+                makers.append(freeze_after_episode_end(maker))
+            vectorise: Any = gym.vector.SyncVectorEnv
             if use_async_envs and n_envs > 1:
-                together = partial(gym.vector.AsyncVectorEnv, context="forkserver")
-            found[suite] = {0: together(made, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP)}
-        return found
+                vectorise = partial(gym.vector.AsyncVectorEnv, context="forkserver")
+            vector_environments[suite] = {0: vectorise(makers, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP)}
+        return vector_environments
 
     def _theirs(self) -> Any:
+        """Return the configuration of lerobot's own LIBERO environment."""
         return LiberoEnv(observation_height=self.observation_height, observation_width=self.observation_width)
 
     def _evaluation(self, settings: EpisodeSettings, archive: Path | None) -> Evaluation | None:
-        """Where rows go, under the identity of the policy that lerobot is told to load."""
+        """Return the evaluation that stores rows under the identity of lerobot's policy; `None` without ``out``.
+
+        Raises:
+            PipelineError: if the policy is not a local folder.
+        """
         if self.out is None:
             return None
         folder = get_path_arg("policy")

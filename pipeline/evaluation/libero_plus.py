@@ -1,9 +1,10 @@
-"""LIBERO-Plus's test tasks rebuilt from their parameters, as its own code sets them up.
+"""LIBERO-Plus's test tasks, rebuilt from their parameters exactly as the benchmark's code builds them.
 
-Tasks that change the camera, the robot, the noise, the instruction or where things stand need LIBERO's assets alone,
-and so do 62 of background. The others of background, light and layout (confounding objects) need scenes, images and
-models of LIBERO-Plus's asset archive (``assets.zip``, 6.4 GB, in the dataset Sylvest/LIBERO-plus on the hub), which
-takes the place of LIBERO's assets in the benchmark. Which files a task needs is read from its code, as text.
+Tasks that change the camera, the robot, the noise, the instruction or the poses of objects need only LIBERO's assets.
+62 of the background tasks also need only LIBERO's assets. The other tasks of background, light and layout (confounding
+objects) need scenes, images and models of LIBERO-Plus's asset archive, which replaces LIBERO's assets in the benchmark.
+The archive is ``assets.zip``, 6.4 GB, in the dataset Sylvest/LIBERO-plus on the hub. The file names that a task needs
+are read from the benchmark's code, as text.
 """
 
 import io
@@ -34,19 +35,19 @@ from pipeline.testset.definitions import Reader, SceneFiles
 from pipeline.types import Floats
 
 RUNNABLE = ("camera", "robot", "noise", "language", "pose")
-"""The axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
+"""Axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
 
 DECIMALS = 4
-"""To which the benchmark rounds its camera after each turn."""
+"""Number of decimals to which the benchmark rounds its camera after each turn."""
 
 ROTATION_RAD = {"x": (-np.pi / 2, -np.pi / 2), "y": (-np.pi, -np.pi), "z": (np.pi, np.pi)}
-"""How LIBERO's reset turns an added object: the same for all 867 models of the benchmark."""
+"""Ranges of angles by which LIBERO's reset turns an added object, equal for all 867 models of the benchmark."""
 
 
 class TestCamera(CameraPerturbation):
-    """The agent view of a test task: rounded after each turn, also where nothing turns it.
+    """Agent view of a test task: rounded after each turn, and rounded even if the camera is not turned.
 
-    So the camera of a task that changes something else is off LIBERO's own by up to 5e-5 (m, and in the quaternion).
+    Therefore the camera of a task on another axis differs from LIBERO's own by up to 5e-5 (m, and in the quaternion).
     """
 
     __test__: ClassVar[bool] = False
@@ -55,16 +56,17 @@ class TestCamera(CameraPerturbation):
         """Move the model's agent view; nothing else in the model changes."""
         camera = model.camera("agentview")
         pos_m, quat_wxyz = camera.pos.copy(), camera.quat.copy()
-        # In the benchmark's order; each step leaves the other parameters neutral.
-        for changed in self._steps():
-            placed = changed.pose(pos_m, quat_wxyz / np.linalg.norm(quat_wxyz))
-            pos_m, quat_wxyz = (np.array([round(float(number), DECIMALS) for number in part]) for part in placed)
-        # SciPy's ``Rotation``, with which the benchmark turns, makes it a unit quaternion.
+        # The steps follow the benchmark's order; each step leaves the other parameters neutral.
+        for step in self._steps():
+            placed_m, turned_wxyz = step.pose(pos_m, quat_wxyz / np.linalg.norm(quat_wxyz))
+            pos_m, quat_wxyz = _rounded(placed_m), _rounded(turned_wxyz)
+        # The benchmark turns with SciPy's ``Rotation``, which normalises the quaternion.
         camera.pos[:], camera.quat[:] = pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)
 
     def _steps(self) -> list[CameraPerturbation]:
-        # Angles from 0 to 360, as the benchmark's names have them: a half is rounded another way after 330 than after
-        # -30. The last two turn the orientation alone, about the world's axes, as ``pose`` does.
+        """List the changes of the camera, one parameter each, in the benchmark's order."""
+        # Angles are in [0, 360) as in the benchmark's names: 330 rounds halves differently than -30.
+        # Yaw and pitch turn the orientation alone, about the world's axes, as ``pose`` does.
         steps = {
             "elevation_deg": self.elevation_deg,
             "azimuth_deg": self.azimuth_deg % 360,
@@ -72,59 +74,70 @@ class TestCamera(CameraPerturbation):
             "yaw_deg": self.yaw_deg % 360,
             "pitch_deg": self.pitch_deg % 360,
         }
-        # But for the azimuth, nothing is rounded that is not changed.
+        # A neutral parameter causes no step and so no rounding, except the azimuth, which always causes a step.
         neutral = {"elevation_deg": 0, "distance_scale": 1, "yaw_deg": 0, "pitch_deg": 0}
-        return [
-            CameraPerturbation.model_validate({"component": self.component, "level": self.level, name: value})
-            for name, value in steps.items()
-            if value != neutral.get(name)
-        ]
+        changes: list[CameraPerturbation] = []
+        for name, value in steps.items():
+            if value != neutral.get(name):
+                fields = {"component": self.component, "level": self.level, name: value}
+                changes.append(CameraPerturbation.model_validate(fields))
+        return changes
+
+
+def _rounded(numbers: Floats) -> Floats:
+    """Round each number to ``DECIMALS`` with Python's own ``round``, as the benchmark does."""
+    return np.array([round(float(number), DECIMALS) for number in numbers])
 
 
 def camera(test: TestTask) -> TestCamera:
-    """The agent view of a test task, whatever its axis."""
+    """Return the agent view of a test task on any axis."""
     if test.axis != "camera":
         return TestCamera(component="orientation", level=1)
     return TestCamera.model_validate({"component": test.component, "level": level_of_test(test), **test.parameters})
 
 
 def noise(test: TestTask, seed: int) -> NoisePerturbation:
-    """The corruption of a noise task.
+    """Return the corruption of a noise task.
 
     Args:
-        seed: of what is drawn anew for every frame: the direction of motion, fog and glass. The benchmark draws it from
-            a global generator.
+        seed: seed of the parameters that are sampled for every frame: the direction of motion, fog and glass. The
+            benchmark samples them from a global generator.
     """
-    own = int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53))
-    what = {"component": test.component, "effect": effect_of(test), "level": level_of_test(test), "seed": own}
-    return NoisePerturbation.model_validate(what)
+    task_seed = int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53))
+    fields = {
+        "component": test.component,
+        "effect": effect_of(test),
+        "level": level_of_test(test),
+        "seed": task_seed,
+    }
+    return NoisePerturbation.model_validate(fields)
 
 
 @cache
 def postures_rad() -> dict[int, tuple[float, ...]]:
-    """Number of a robot task's start to the (7,) joint angles in its class's table, with all of their digits."""
+    """Return start number of robot tasks to the (7,) joint angles in the start's class, with all their digits."""
     source = _reader().packed("envs/robots/mounted_panda.py").decode()
     listed = re.findall(r"class MountedPanda(\d+)\(.*?np\.array\(\[([^\]]+)\]\)", source, flags=re.DOTALL)
     return {int(number): tuple(map(float, row.split(","))) for number, row in listed}
 
 
 def bddl_text(test: TestTask) -> str:
-    """The file that defines the scene of a pose or layout task."""
+    """Return the text of the BDDL file that defines the scene of a pose or layout task."""
     return _reader().packed(f"bddl_files/{test.suite}/{test.name}.bddl").decode()
 
 
 def moved_state(suite: str, name: str) -> Floats:
-    """(S,) the one state of a task that moves objects."""
+    """Return the (S,) initial state of a task that moves objects; each such task has one state."""
     return saved_array(_reader().packed(f"init_files/libero_newobj/{suite}/{name}.pruned_init")).reshape(-1)
 
 
 def saved_array(content: bytes) -> Floats:
-    """The array that ``torch.save`` wrote as a pickle, by PyTorch's own reader, which runs none.
+    """Read an array that ``torch.save`` wrote as a pickle, with PyTorch's own reader, which runs no code of the pickle.
 
     Raises:
-        UnpicklingError: when the pickle names anything but what makes an array of numbers.
+        UnpicklingError: if the pickle names anything that is not needed for an array of numbers.
     """
-    import torch  # which takes seconds, and few tasks need
+    import torch  # takes seconds, and few tasks need it
 
     reconstruct: Any = np.empty(0).__reduce__()[0]
     named = (reconstruct, "numpy.core.multiarray._reconstruct")
@@ -133,23 +146,27 @@ def saved_array(content: bytes) -> Floats:
 
 
 def instruction(test: TestTask, prompt: Prompt) -> str:
-    """What a policy is told in a test task; a language task is worded as it says, unless nothing is said."""
+    """Return the instruction of a test task.
+
+    A language task has its own wording, except with the prompt ``blank``, which makes every instruction empty.
+    """
     if prompt == "blank":
         return ""
     if test.axis == "language":
         return str(test.parameters["text"])
     if prompt == "clean":
         return find_task(test.suite, test.base).instruction
-    # Such as KITCHEN_SCENE3_turn_on_the_stove.
+    # Example of a name: KITCHEN_SCENE3_turn_on_the_stove.
     return re.sub(r"^[A-Z].*?SCENE\d+_", "", test.name).replace("_", " ")
 
 
 def assets_of(test: TestTask, archive: Path | None = None) -> Path | None:
-    """LIBERO's assets or the archive, whichever has the files that a test task names; None if neither, where it cannot
-    be rebuilt.
+    """Return LIBERO's assets or the archive: the first that has all files that a test task names.
+
+    Return `None` if neither has the files, so that the task cannot be rebuilt.
 
     Args:
-        archive: folder of the unpacked archive, where there is one.
+        archive: folder of the unpacked archive, if there is one.
     """
     for folder in (libero_assets(), archive):
         if folder is not None and all((unpacked(folder) / path).is_file() for path in _named(test)):
@@ -159,13 +176,13 @@ def assets_of(test: TestTask, archive: Path | None = None) -> Path | None:
 
 @cache
 def unpacked(folder: Path) -> Path:
-    """The folder with ``scenes``, ``textures`` and ``new_objects``.
+    """Find the folder with ``scenes``, ``textures`` and ``new_objects`` at or below a folder.
 
-    The archive has its files below the path that they had on the machine that packed it, so ``folder`` may be any on
-    the way to them.
+    The archive stores its files below their path on the machine that packed the archive. Therefore ``folder`` may be
+    any folder on this path.
 
     Raises:
-        PipelineError: when there is none.
+        PipelineError: if there is no such folder.
     """
     root = folder
     while not (root / "scenes").is_dir():
@@ -182,8 +199,8 @@ def unpacked(folder: Path) -> Path:
 
 
 def register_objects(test: TestTask, assets: Path) -> None:
-    """Let LIBERO build scenes with the objects that a layout task adds, by the categories of its BDDL file."""
-    control_env()  # which takes care of how it is imported
+    """Register the objects that a layout task adds with LIBERO, under the categories of its BDDL file."""
+    control_env()  # imports LIBERO in the right way
     from libero.libero.envs.base_object import OBJECTS_DICT
 
     for category, path in object_models(test).items():
@@ -191,10 +208,13 @@ def register_objects(test: TestTask, assets: Path) -> None:
 
 
 def contents(test: TestTask, archive: Path | None) -> list[str]:
-    """SHA-256 of each file of LIBERO's assets or the archive that a test task is made from: those that it names, then
-    those that they refer to."""
+    """Compute the SHA-256 of each file of LIBERO's assets or the archive that a test task uses.
+
+    The list starts with the files that the task names, followed by the files to which those refer.
+    """
     assets = assets_of(test, archive)
     files = [] if assets is None else [assets / path for path in _named(test)]
+    # The loop also visits the files that it appends.
     for file in files:
         if file.suffix == ".xml":
             read = (file.parent / path for path in _referred(edition(file)))
@@ -203,6 +223,7 @@ def contents(test: TestTask, archive: Path | None) -> list[str]:
 
 
 def _named(test: TestTask) -> Iterable[str]:
+    """List the asset files that a test task names, by their paths in the archive."""
     if test.axis == "layout":
         return object_models(test).values()
     return scene_files(test) if test.axis in ("light", "background") else ()
@@ -210,6 +231,11 @@ def _named(test: TestTask) -> Iterable[str]:
 
 @cache
 def _referred(file: Edition) -> tuple[str, ...]:
+    """List the files to which an MJCF file refers.
+
+    Raises:
+        PipelineError: if the file is not XML.
+    """
     try:
         return tuple(element.attrib["file"] for element in ET.parse(file.path).iterfind(".//*[@file]"))
     except ET.ParseError as error:
@@ -217,26 +243,28 @@ def _referred(file: Edition) -> tuple[str, ...]:
 
 
 def scene_files(test: TestTask) -> SceneFiles:
-    """Of a light or background task, by their paths in the archive."""
+    """Return the scene files of a light or background task, by their paths in the archive."""
     return _reader().scene_files(test.suite, test.name)
 
 
 def object_models(test: TestTask) -> dict[str, str]:
-    """Category to MJCF, by its path in the archive, of the objects that a layout task adds."""
+    """Return category to MJCF file, by its path in the archive, of the objects that a layout task adds."""
     models = _reader().object_models
     return {category: models[category] for category in str(test.parameters["category"]).split(",")}
 
 
 @cache
 def _reader() -> Reader:
+    """Return the reader of the benchmark's code."""
     return Reader(zipfile.ZipFile(benchmark.fetch_testset()))
 
 
 def _object_class(category: str, file: Path) -> Any:
+    """Return a robosuite class for a model of the archive."""
     from robosuite.models.objects import MujocoXMLObject
 
     class AddedObject(MujocoXMLObject):  # type: ignore[misc]
-        """A model of the archive as the benchmark's code loads it."""
+        """Model of the archive, loaded like in the benchmark's code."""
 
         def __init__(self, name: str = category):
             joints = [{"type": "free", "damping": "0.0005"}]
@@ -246,7 +274,13 @@ def _object_class(category: str, file: Path) -> Any:
             self.rotation, self.rotation_axis = ROTATION_RAD, None
 
         def _get_object_subtree(self) -> Any:
-            """The body ``object``; robosuite expects it in another body, these models may have it at the top."""
+            """Return the body ``object``.
+
+            robosuite expects this body inside another body, but these models may have it at the top.
+
+            Raises:
+                PipelineError: if the model has no such body.
+            """
             if self.worldbody.find("./body/body[@name='object']") is not None:
                 return super()._get_object_subtree()
             body = self.worldbody.find("./body[@name='object']")

@@ -1,4 +1,4 @@
-"""Draws of the axes that no plan has: how they are drawn, and kept clear of a plan."""
+"""Held-out perturbations: perturbations that no plan has, and their distance to a plan."""
 
 from __future__ import annotations
 
@@ -27,36 +27,39 @@ from pipeline.seeding import digest
 from pipeline.types import Demo, Scene, Task
 
 OWN_AXES = tuple(name for name, axis in AXES.items() if not axis.not_held_out)
-"""The axes with draws of their own to hold out."""
+"""Axes that have held-out perturbations."""
 
 ATTEMPTS = 20
-"""How often a draw is sampled again that its scene refuses, that shows too little, or that a plan has."""
+"""Number of samples per axis of a task; a sample is rejected by its scene, by its visibility, or by a plan."""
 
 
 def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
-    """A held-out perturbation on a LIBERO task; None where an axis cannot change anything that the task has.
+    """Return a LIBERO task with a held-out perturbation.
+
+    Return `None` if one of the axes cannot change anything in the task.
 
     Args:
-        axis: one, or several joined by +.
-        number: counts the draws of a task, axis and level.
+        axis: name of an axis, or names of several axes joined by +.
+        number: number of the perturbation among those of the same task, axis and level.
     """
-    axes = axes_of(axis)
-    if not all(held_out(one).applies(task) for one in axes):
+    names = axes_of(axis)
+    if not all(held_out(name).applies(task) for name in names):
         return None
-    name = f"{task.name}_{axis}_level{level}_draw{number}"
-    drawn = EvaluationTask("own", task.suite, task.name, name, axis, "", level, number)
-    return replace(drawn, component="+".join(draw(drawn, seed, axis=one).component for one in axes))
+    task_name = f"{task.name}_{axis}_level{level}_draw{number}"
+    drawn = EvaluationTask("own", task.suite, task.name, task_name, axis, "", level, number)
+    components = [draw(drawn, seed, axis=name).component for name in names]
+    return replace(drawn, component="+".join(components))
 
 
 def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> Perturbation:
-    """The perturbation of a task on one axis.
+    """Sample the perturbation of a task on one axis.
 
-    Its key begins with ``evaluation``, which no plan's does, so that no seed makes the two draw alike. What a draw is
-    joined with is not part of the key: a pair has the draws of its singles.
+    The random key begins with ``evaluation``. No plan's key does, so no seed gives a plan the same perturbations. The
+    joined axes are not part of the key, so a pair has the perturbations of its single axes.
 
     Args:
-        attempt: counts the draws that were refused.
-        axis: which, where the task joins several.
+        attempt: number of perturbations that were rejected before.
+        axis: the axis, if the task joins several.
     """
     name = axis or task.axis
     key = seeding.rng("evaluation", seed, name, task.suite, task.base, task.level, task.number, attempt)
@@ -65,13 +68,16 @@ def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> P
 
 
 def first_draws(task: EvaluationTask, seed: int) -> str:
-    """Digest of a task's first draw on each axis, by which another version tells whether it draws the same."""
+    """Compute a digest of a task's first perturbation on each axis.
+
+    Another version of this project compares the digest to detect that it samples different perturbations.
+    """
     return digest(to_json(draw(task, seed, axis=axis) for axis in axes_of(task.axis)))[:16]
 
 
 @cache
 def held_out(name: str) -> Axis:
-    """The ranges of an axis's held-out perturbations."""
+    """Return the ranges of an axis's held-out perturbations."""
     return AXES[name].held_out()
 
 
@@ -83,118 +89,147 @@ def drawn_scene(
     planned: PlannedDraws | None,
     opened: LastScene,
 ) -> tuple[tuple[Perturbation, ...], Scene | None]:
-    """What a task draws, in the order in which it applies, and the scene with it; None where physics stay LIBERO's.
+    """Sample the perturbations of a task, and return them with the perturbed scene.
 
-    Each axis has the first draw that the scene takes by itself, and that shows as much as a run asks of an episode.
-    That is so too where other axes join it, so that a pair has the draws of its singles. They apply one after the
-    other, as those of a plan do.
+    Each axis gets the first perturbation that the scene accepts alone and that is as visible as a run requires of its
+    episodes. The choice does not depend on the joined axes, so a pair has the perturbations of its single axes. The
+    perturbations apply one after the other, as in a plan.
 
     Args:
-        demo: of the task, in the initial state that the episode begins in.
-        nominal: gives the scene without any change.
-        planned: what draws must keep clear of.
-        opened: renders what is judged.
+        demo: demonstration of the task, in the initial state with which the episode begins.
+        nominal: returns the scene without perturbations.
+        planned: perturbations to which the samples must keep the clearance; `None` compares with no plan.
+        opened: renderer for the visibility check.
+
+    Returns:
+        The perturbations in the order in which they apply, and the scene; `None` if physics stay LIBERO's.
 
     Raises:
-        RefusedError: when the scene takes no draw of an axis, or not the draws of several together.
+        RefusedError: if the scene accepts no perturbation of an axis, or rejects the perturbations of several axes
+            together.
     """
     perturbations: list[Perturbation] = []
     scene = None
     for axis in axes_of(task.axis):
-        draws = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
-        clear = (one for one in draws if planned is None or not planned.overlap(one, demo.task))
-        alone = next((taken for one in clear if (taken := _taken(one, demo, nominal, opened))), None)
-        if alone is None:
-            raise RefusedError(f"no_{axis}_draw_fits")
-        one, moved = alone
-        if isinstance(one, PhysicsPerturbation):
-            scene = moved if scene is None else one.apply(scene, demo, roll_out)
-        perturbations.append(one)
-    together = len(perturbations) > 1 and any(map(held_out_sight.can_hide, perturbations))
-    if together and (fault := held_out_sight.fault(scene or nominal(), demo, perturbations, opened)):
-        raise RefusedError(fault)
+        samples = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
+        far_from_plan = (sample for sample in samples if planned is None or not planned.overlap(sample, demo.task))
+        perturbation, moved = _first_accepted(far_from_plan, axis, demo, nominal, opened)
+        if isinstance(perturbation, PhysicsPerturbation):
+            scene = moved if scene is None else perturbation.apply(scene, demo, roll_out)
+        perturbations.append(perturbation)
+    if len(perturbations) > 1 and any(map(held_out_sight.can_hide, perturbations)):
+        fault = held_out_sight.fault(scene or nominal(), demo, perturbations, opened)
+        if fault:
+            raise RefusedError(fault)
     return tuple(perturbations), scene
 
 
-def _taken(
-    one: Perturbation, demo: Demo, nominal: Callable[[], Scene], opened: LastScene
-) -> tuple[Perturbation, Scene] | None:
-    """A draw and the scene with it alone; None where the scene refuses it, or too little can be seen."""
+def _first_accepted(
+    samples: Iterable[Perturbation], axis: str, demo: Demo, nominal: Callable[[], Scene], opened: LastScene
+) -> tuple[Perturbation, Scene]:
+    """Return the first perturbation that its scene accepts, and the scene with this perturbation alone.
+
+    Raises:
+        RefusedError: if the scene accepts no perturbation.
+    """
+    for perturbation in samples:
+        scene = _scene_with(perturbation, demo, nominal, opened)
+        if scene is not None:
+            return perturbation, scene
+    raise RefusedError(f"no_{axis}_draw_fits")
+
+
+def _scene_with(
+    perturbation: Perturbation, demo: Demo, nominal: Callable[[], Scene], opened: LastScene
+) -> Scene | None:
+    """Return the scene with one perturbation; `None` if the scene rejects it or if too little is visible."""
     scene = nominal()
-    if isinstance(one, PhysicsPerturbation):
+    if isinstance(perturbation, PhysicsPerturbation):
         try:
-            scene = one.apply(scene, demo, roll_out)
+            scene = perturbation.apply(scene, demo, roll_out)
         except RefusedError:
             return None
-    if held_out_sight.can_hide(one) and held_out_sight.fault(scene, demo, (one,), opened):
+    if held_out_sight.can_hide(perturbation) and held_out_sight.fault(scene, demo, (perturbation,), opened):
         return None
-    return one, scene
+    return scene
 
 
 class PlannedDraws:
-    """What a plan draws, to keep held-out perturbations clear of it.
+    """Perturbations of a plan, with which held-out perturbations are compared.
 
-    Distances are those of the leakage report, with the plan in the place of the benchmark's test tasks.
+    Distances are those of the leakage report, with the plan in place of the benchmark's test tasks.
 
     Args:
-        rows: of the plan, reserves among them.
+        rows: rows of the plan, including reserves.
     """
 
     def __init__(self, rows: Iterable[plan.Row]):
         self._draws: dict[Hashable, list[tuple[Perturbation, str]]] = defaultdict(list)
         self.counts = Counter[str]()
-        """Axis to the number of its draws."""
+        """Axis to the number of its perturbations."""
         for row in rows:
             task = find_task(row.suite, row.task)
-            for one in from_json(row.perturbations):
-                self._draws[_comparable(one, task)].append((one.in_scene(task), row.episode_id))
-                self.counts[one.axis] += 1
+            for perturbation in from_json(row.perturbations):
+                key = _comparable(perturbation, task)
+                self._draws[key].append((perturbation.in_scene(task), row.episode_id))
+                self.counts[perturbation.axis] += 1
 
     def nearest(self, drawn: Perturbation, task: Task) -> tuple[float, str]:
-        """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
-        episode, where there is none to compare with."""
-        others = self._draws.get(_comparable(drawn, task), [])
-        distances = drawn.in_scene(task).apart([other for other, _ in others]) if others else np.array([])
+        """Return the distance to the nearest planned perturbation on the same axis, and its episode.
+
+        If the plan has nothing to compare with, the distance is infinite and the episode is empty.
+        """
+        comparable = self._draws.get(_comparable(drawn, task), [])
+        if not comparable:
+            return math.inf, ""
+        distances = drawn.in_scene(task).apart([perturbation for perturbation, _ in comparable])
         if not np.isfinite(distances).any():
             return math.inf, ""
         closest = int(np.nanargmin(distances))
-        return float(distances[closest]), others[closest][1]
+        _, episode = comparable[closest]
+        return float(distances[closest]), episode
 
     def overlap(self, drawn: Perturbation, task: Task) -> bool:
-        """Whether a draw is a planned one, or closer to one than the axis keeps from the benchmark's test tasks."""
+        """Return whether a perturbation equals a planned one or is closer to one than the axis's clearance."""
         distance, _ = self.nearest(drawn, task)
         return distance == 0 or distance < drawn.clearance
 
 
 def _comparable(drawn: Perturbation, task: Task) -> Hashable:
-    """Equal for draws that have a distance."""
+    """Return a key that is equal for perturbations between which a distance is defined."""
     return type(drawn), drawn.same and shared(task, drawn.same)
 
 
 def planned(file: Path) -> PlannedDraws:
-    """The draws of a plan's file, read once a process.
+    """Read the perturbations of a plan's file, once per process.
 
     Raises:
-        PipelineError: when it is not a plan of this version.
+        PipelineError: if the file is not a plan of this version.
     """
     return _planned(_edition(file))
 
 
 @cache
 def _planned(file: Edition) -> PlannedDraws:
+    """Read the perturbations of one edition of a plan's file."""
     return PlannedDraws(plan.read(file.path))
 
 
 def sha256_of(file: Path) -> str:
-    """By which results name a plan.
+    """Compute the SHA-256 of a plan's file, which names the plan in results.
 
     Raises:
-        PipelineError: when the file cannot be read.
+        PipelineError: if the file cannot be read.
     """
     return checksum_of(_edition(file))
 
 
 def _edition(file: Path) -> Edition:
+    """Return the current edition of a plan's file.
+
+    Raises:
+        PipelineError: if the file cannot be read.
+    """
     try:
         return edition(file)
     except OSError as error:
@@ -202,26 +237,32 @@ def _edition(file: Path) -> Edition:
 
 
 def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:
-    """How close held-out perturbations come to a plan.
+    """Compare held-out perturbations with a plan.
 
     Args:
-        drawn: the name of each, the draw, and the task that it changes.
+        drawn: name, perturbation and perturbed task of each held-out perturbation.
 
     Returns:
-        Axis to how many ``draws`` there are, how many are ``planned``, in how many a plan's draw ``overlaps``, and the
-        ``smallest`` distance with the names of its draw and of its planned episode (``closest``), None where nothing
-        could be compared. ``clearance`` is the least distance that the leakage report allows.
+        Axis to a dictionary with these keys:
+
+        * ``draws``: number of held-out perturbations.
+        * ``planned``: number of planned perturbations.
+        * ``overlaps``: number of held-out perturbations that overlap with a planned one.
+        * ``smallest``: the smallest distance; `None` if nothing could be compared.
+        * ``closest``: names of the perturbation and of the planned episode at the smallest distance, or `None`.
+        * ``clearance``: the least distance that the leakage report allows.
     """
-    found = {}
+    by_axis = {}
     for axis, draws in grouped((named[1].axis, named) for named in drawn).items():
-        smallest, episode, name = min((*planned_draws.nearest(one, task), name) for name, one, task in draws)
+        distances = [(*planned_draws.nearest(perturbation, task), name) for name, perturbation, task in draws]
+        smallest, episode, name = min(distances)
         compared = math.isfinite(smallest)
-        found[axis] = {
+        by_axis[axis] = {
             "draws": len(draws),
             "planned": planned_draws.counts[axis],
-            "overlaps": sum(planned_draws.overlap(one, task) for _, one, task in draws),
+            "overlaps": sum(planned_draws.overlap(perturbation, task) for _, perturbation, task in draws),
             "smallest": smallest if compared else None,
             "closest": (name, episode) if compared else None,
             "clearance": draws[0][1].clearance,
         }
-    return found
+    return by_axis

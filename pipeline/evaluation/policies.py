@@ -1,4 +1,4 @@
-"""What acts: the questions that a policy is asked, and policies behind a model server or in a lerobot checkpoint."""
+"""Policies: their interface, and policies behind a model server or in a lerobot checkpoint."""
 
 import asyncio
 from collections.abc import Callable
@@ -18,17 +18,18 @@ from pipeline.seeding import digest
 from pipeline.types import Floats
 
 VIEWS = {"agentview": "image", "wrist": "wrist_image"}
-"""What policies call the views, to their names in ``schemas/episode.json``."""
+"""Name of a view for policies to its name in ``schemas/episode.json``."""
 
 
 class Wanted(NamedTuple):
-    """What a policy asks to see.
+    """Parts of an observation that a policy asks for.
 
     Attributes:
+        wrist: the wrist view.
         state: position, axis-angle and fingers.
-        shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
-            robosuite and OpenVLA's data have it.
-        images: any view at all; without them nothing is rendered.
+        shortest_rotation: if set, the axis-angle has an angle in [0, pi], vla-eval's default. Else the angle is in
+            [0, 2 pi], as in robosuite and OpenVLA's data.
+        images: any view; without images nothing is rendered.
     """
 
     wrist: bool = True
@@ -38,60 +39,68 @@ class Wanted(NamedTuple):
 
 
 Look = Callable[[Wanted], dict[str, Any]]
-"""Gives the observation; frames are rendered when it is called."""
+"""Function that returns the observation; a call renders the frames."""
 
 
 class Policy(Protocol):
-    """Asked for actions until the episode is over."""
+    """Policy that gives actions until the episode is over."""
 
     name: str
     wanted: Wanted
-    """What it looks at."""
+    """Parts of an observation that the policy uses."""
 
     def begin(self, task: EvaluationTask) -> None:
-        """An episode begins."""
+        """Begin an episode."""
 
     def act(self, look: Look) -> Any:
-        """The actions to take next, (n, 7) or (7,) for one, as ``checked_actions`` takes them; looks only when it has
-        to.
+        """Return the next actions, (n, 7) or (7,) for one action, in the format of ``checked_actions``.
+
+        Args:
+            look: function that returns the observation; the policy calls it only if it needs a new observation.
 
         Raises:
-            PolicyError: when there is no answer.
+            PolicyError: if there is no answer.
         """
 
     def end(self, success: bool) -> None:
-        """It is over."""
+        """End the episode."""
 
 
 class NextLook:
-    """When a model server has to be shown the scene anew.
+    """Counter of the actions until a model server needs a new observation.
 
-    A server that answers with a chunk (n, 7) computes its next answer when those actions are taken, from what it is
-    shown then. One that answers with a single action (7,) may have taken it from a chunk that it keeps, which nobody
-    but itself knows; it is shown the scene once in ``every`` control steps.
+    A server that answers with a chunk (n, 7) computes its next answer after these actions, from a new observation. A
+    server that answers with a single action (7,) may take it from a chunk that only the server knows. It gets a new
+    observation every ``every`` control steps.
     """
 
     def __init__(self, every: int):
         self._every = every
         self.left = 0
-        """Actions that are taken before the next look, which is due at 0, as when an episode begins."""
+        """Number of actions before the next observation. At 0, for example when an episode begins, it is due."""
 
     def answered(self, actions: Any) -> None:
-        """Args: actions: (n, 7) or (7,), all of which are taken before the next question."""
+        """Count an answer.
+
+        Args:
+            actions: (n, 7) or (7,) actions, which are all taken before the server is asked again.
+        """
         self.left = (self.left or self._every) - 1 if np.ndim(actions) == 1 else 0
 
 
 class Server:
-    """A model server of vla-eval. It is asked at every step, or, where it answers with a chunk, once in a chunk.
+    """Model server of vla-eval. It is asked at every step, or once per chunk if it answers with chunks.
 
-    A connection that failed is closed, and the next episode begins on a new one: the server keeps the state of an
-    episode with its connection, and an answer that comes late must not be taken for that to a later question.
+    A failed connection is closed, and the next episode begins on a new connection, for two reasons. The server keeps
+    the state of an episode with its connection. A late answer must not be mistaken for the answer to a later request.
 
     Args:
-        address: such as ``ws://localhost:8000``.
+        address: address of the server, such as ``ws://localhost:8000``.
+        timeout_s: time limit of an answer.
+        look_every: number of control steps between two observations, see ``NextLook``.
 
     Raises:
-        PipelineError: when no server answers there, or its actions cannot be executed.
+        PipelineError: if no server answers at the address, or if its actions cannot be executed.
     """
 
     def __init__(self, address: str, timeout_s: float = 120.0, look_every: int = 1):
@@ -108,12 +117,18 @@ class Server:
         self._seen: dict[str, Any] = {}
 
     def begin(self, task: EvaluationTask) -> None:
+        """Begin an episode, on a new connection if the last connection failed."""
         self._next_look.left = 0
         if not self._connection.is_connected:
             self._connect()
         self._run(self._connection.start_episode({"task": task.for_harness()}), self._connection.timeout)
 
     def act(self, look: Look) -> Any:
+        """Return the server's answer, (n, 7) or (7,), to the current or the last observation.
+
+        Raises:
+            PolicyError: if the server does not answer with actions.
+        """
         if self._next_look.left == 0:
             self._seen = look(self.wanted)
         if not self._connection.is_connected:
@@ -127,16 +142,23 @@ class Server:
         return actions
 
     def end(self, success: bool) -> None:
-        # The episode is over, whether the server hears of it or not.
+        """End the episode, and report its success to the server."""
+        # The episode is over even if the report does not reach the server.
         with suppress(PolicyError):
             self._run(self._connection.end_episode({"metrics": {"success": success}}), self._connection.timeout)
 
     def close(self) -> None:
+        """Close the connection."""
         self._loop.run_until_complete(self._connection.close())
         self._loop.close()
 
     def _connect(self) -> None:
-        """Raises: PipelineError: when no server answers, or with other actions: not the fault of one episode."""
+        """Connect to the server, and read what it announces.
+
+        Raises:
+            PipelineError: if no server answers, or if its actions cannot be executed. It is no ``PolicyError``, because
+                the fault concerns all episodes.
+        """
         try:
             self._run(self._connection.connect(benchmark="PerturbedLibero"))
         except PolicyError as error:
@@ -159,10 +181,15 @@ class Server:
         )
 
     def _run(self, awaited: Any, limit_s: float | None = None) -> Any:
+        """Wait for a reply of the connection.
+
+        Raises:
+            PolicyError: if the reply is late or the connection fails; the connection is closed.
+        """
         from websockets.exceptions import WebSocketException
 
         try:
-            # Sending waits too, once a server that hangs has let its buffers fill.
+            # The limit covers sending too: sending waits when the buffers of a hanging server are full.
             return self._loop.run_until_complete(asyncio.wait_for(awaited, limit_s))
         except TimeoutError as error:
             raise self._fault(f"no answer within {self._connection.timeout:g} s") from error
@@ -171,18 +198,23 @@ class Server:
             raise self._fault(f"the model server does not answer as it should ({what})") from error
 
     def _fault(self, what: str) -> PolicyError:
+        """Close the connection, and return an error."""
         self._loop.run_until_complete(self._connection.close())
         return PolicyError(what, where=self.name, remedy="see the server's log")
 
 
 class Checkpoint:
-    """A policy that lerobot saved, run in this process.
+    """Policy that lerobot saved, run in this process.
 
-    It is asked for a chunk where it makes chunks, so that it looks once in ``n_action_steps``. Frames get the size of
-    those that it was trained on. Random numbers, such as a diffusion policy draws, follow from the task alone.
+    If the policy predicts chunks, it is asked for chunks, so that it observes once per ``n_action_steps``. Frames are
+    resized to the size of its training frames. Random numbers, such as those of a diffusion policy, depend on the task
+    alone.
 
     Args:
-        folder: with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
+        folder: folder with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
+
+    Raises:
+        PipelineError: if the policy wants an image that the tasks do not have.
     """
 
     wanted = Wanted()
@@ -204,7 +236,8 @@ class Checkpoint:
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
         )
         cameras = {SCHEMA.views[view].lerobot_key: name for name, view in VIEWS.items()}
-        if unknown := ", ".join(key for key in config.image_features if key not in cameras):
+        unknown = ", ".join(key for key in config.image_features if key not in cameras)
+        if unknown:
             raise PipelineError(f"the policy wants the images {unknown}", where=folder, expected=", ".join(cameras))
         self._cameras = {key: name for key, name in cameras.items() if key in config.image_features}
         self._sizes_px = {key: config.image_features[key].shape[1:] for key in self._cameras}
@@ -212,18 +245,20 @@ class Checkpoint:
         self._chunk = int(getattr(config, "n_action_steps", 1)) if chunked else 1
 
     def begin(self, task: EvaluationTask) -> None:
-        # lerobot's policies draw from this generator alone.
+        """Begin an episode, with random numbers that depend on the task."""
+        # lerobot's policies use no other generator.
         self._torch.manual_seed(int(digest("policy", str(task))[:15], 16))
         self._policy.reset()
 
     def act(self, look: Look) -> Floats:
-        seen = look(self.wanted)
+        """Return the policy's actions for a new observation, (n, 7); n is 1 without chunks."""
+        observation = look(self.wanted)
         batch: dict[str, Any] = {}
         for key, name in self._cameras.items():
-            frame = resized(seen["images"][name], *self._sizes_px[key])
+            frame = resized(observation["images"][name], *self._sizes_px[key])
             batch[key] = self._torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255
-        batch["observation.state"] = self._torch.from_numpy(seen["states"])[None]
-        batch["task"] = [seen["task_description"]]
+        batch["observation.state"] = self._torch.from_numpy(observation["states"])[None]
+        batch["task"] = [observation["task_description"]]
         with self._torch.inference_mode():
             batch = self._before(batch)
             if self._chunk == 1:
@@ -233,27 +268,29 @@ class Checkpoint:
             actions = self._after(actions)
         return np.asarray(actions.cpu().numpy(), np.float64)
 
-    def end(self, success: bool) -> None: ...
+    def end(self, success: bool) -> None:
+        """End the episode, without effect on the policy."""
 
 
 BESIDE = ("train_config.json", "README.md")
-"""Files of a checkpoint that do not decide what it does."""
+"""Files of a checkpoint that do not affect its actions."""
 
 
 def content_of(checkpoint: Path) -> str:
-    """SHA-256 of the files in a checkpoint's folder, by their names: configuration, weights, processors and whatever
-    else is there but ``BESIDE`` and hidden files. What lerobot loads from elsewhere, such as a tokenizer, is not in it.
+    """Compute a digest of a checkpoint: the names and SHA-256 sums of the files in its folder.
+
+    The digest includes configuration, weights, processors and other files, but not ``BESIDE`` and hidden files. It does
+    not include files that lerobot loads from other places, such as a tokenizer.
 
     Raises:
-        PipelineError: when it is no checkpoint.
+        PipelineError: if the folder is not a checkpoint.
     """
     if not (checkpoint / "config.json").is_file():
         raise PipelineError("no config.json", where=checkpoint, expected="a folder that lerobot saved a policy in")
-    inside = {path.relative_to(checkpoint): path for path in checkpoint.rglob("*") if path.is_file()}
-    return digest(
-        {
-            name.as_posix(): checksum(path)
-            for name, path in inside.items()
-            if name.name not in BESIDE and not any(part.startswith(".") for part in name.parts)
-        }
-    )
+    checksums: dict[str, str] = {}
+    for path in checkpoint.rglob("*"):
+        name = path.relative_to(checkpoint)
+        hidden = any(part.startswith(".") for part in name.parts)
+        if path.is_file() and not hidden and name.name not in BESIDE:
+            checksums[name.as_posix()] = checksum(path)
+    return digest(checksums)

@@ -1,4 +1,4 @@
-"""Scripted policies that repeat the starter set's demonstration of a task: what an evaluation can be checked with."""
+"""Scripted policies that repeat the starter set's demonstration of a task, to check an evaluation."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -21,7 +21,11 @@ from pipeline.types import Floats
 
 
 class Replay:
-    """The demonstration's actions, open-loop and without no-ops, then nothing."""
+    """Policy that repeats the demonstration's actions open-loop and without no-ops, and then rests.
+
+    Args:
+        chunk: number of actions per answer.
+    """
 
     name = "replay"
     wanted = Wanted(wrist=False, state=False, images=False)
@@ -30,48 +34,54 @@ class Replay:
         self._chunk = chunk
 
     def begin(self, task: EvaluationTask) -> None:
+        """Begin with the first action of the task's demonstration."""
         recorded = StarterSource().of(find_task(task.suite, task.base)).actions
         self._actions, self._taken = recorded[kept_actions(recorded, "drop")], 0
 
     def act(self, look: Look) -> Floats:
+        """Return the next chunk of actions, (n, 7), or no-ops at the end of the demonstration."""
         actions = self._actions[self._taken : self._taken + self._chunk]
         self._taken += self._chunk
         return actions if len(actions) else np.tile(DUMMY_ACTION, (self._chunk, 1))
 
-    def end(self, success: bool) -> None: ...
+    def end(self, success: bool) -> None:
+        """End the episode, without effect on the policy."""
 
 
 class TrackedReplay:
-    """Follows the hand's path of the demonstration by feedback, one action at a time.
+    """Policy that follows the hand's path of the demonstration by feedback, one action at a time.
 
-    The law is that of the tracked replay that makes datasets (``pipeline.physics.tracking``). It has the end effector's
-    pose alone, which is all that an observation tells, so it does not know where objects are: it goes where the
-    demonstration went, from wherever the arm starts.
+    The control law is that of the tracked replay that generates datasets (``pipeline.physics.tracking``). The policy
+    knows the end effector's pose from observations, but not the poses of objects. Therefore it follows the
+    demonstration's path from any start of the arm.
     """
 
     name = "tracked replay"
     wanted = Wanted(wrist=False, images=False)
 
     def begin(self, task: EvaluationTask) -> None:
+        """Begin with the task's demonstration as the reference."""
         self._reference = _reference(task.suite, task.base)
         self._actions: Iterator[Floats] | None = None
 
     def act(self, look: Look) -> Floats:
+        """Return the next action (7,) from the end effector's pose in a new observation."""
         position, axis_angle, _ = np.split(look(self.wanted)["states"].astype(np.float64), (3, 6))
         self._hand: Hand = position, Rotation.from_rotvec(axis_angle)
         if self._actions is None:
             route = Route.through(self._reference, self._hand, {})
-            # Nothing is held in this reference, so that no object's pose is asked for.
+            # The hand holds no object in this reference, so ``follow`` asks for no object's pose.
             self._actions = follow(route, lambda: self._hand, lambda _: np.zeros(7))
-        # At the end of the path the hand rests, and holds or lets go as the demonstration did.
+        # At the end of the path the hand rests, and the gripper keeps the demonstration's last command.
         return next(self._actions, np.append(np.zeros(6), self._reference.actions[-1, 6]))
 
-    def end(self, success: bool) -> None: ...
+    def end(self, success: bool) -> None:
+        """End the episode, without effect on the policy."""
 
 
 @lru_cache(maxsize=8)
 def _reference(suite: str, base: str) -> Reference:
-    """What observations tell of the demonstration, replayed open-loop from its own first state."""
+    """Return the demonstration as observations show it, replayed open-loop from its own first state."""
     demo = StarterSource().of(find_task(suite, base))
     actions = demo.actions[kept_actions(demo.actions, "drop")]
     with closing(Simulator(demo.task)) as simulator:

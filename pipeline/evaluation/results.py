@@ -1,4 +1,4 @@
-"""The results of an evaluation: a record of each episode in a file of its own, and the results of several folders."""
+"""Results of an evaluation: one file per episode, and the results of several folders."""
 
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -16,33 +16,36 @@ from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
 REFUSED = "refused"
-"""The reason of an episode that could not begin, as its scene does not take what was drawn."""
+"""Reason of an episode that could not begin, because its scene rejects the perturbation."""
 
 ALIKE = {"black": "none", "initial_states": "libero", "fixture_seed": 0}
-"""What results on one suite of one source must have in common to be compared, beside prompt and step limit: settings,
-and what they are where a result leaves them out."""
+"""Settings, and their values if a result leaves them out. Results on one suite of one source can be compared only if
+these settings, the prompt and the step limit are equal."""
 
 PER_TASK = ("draws", "files of the benchmark")
-"""The versions of a result that each task has its own of."""
+"""Versions of a result that differ between tasks."""
 
 Trial = tuple[EvaluationTask, int, str]
-"""The whole task, the seed, and what was drawn: the same for results that can be compared one by one."""
+"""Task, seed and perturbations. Results of two policies can be compared one by one if their trials are equal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult(EvaluationTask):
-    """One episode: its task, and what came of it; JSON-serialisable.
+    """Result of one episode, with its task; JSON-serialisable.
 
     Attributes:
-        component: as drawn, where the scene refused the first draw.
-        episode: names it by what it is made from.
-        seed: of what is drawn for the task: its perturbations, and noise that is random.
-        reason: why it ended, see ``Progress``; ``success`` says whether the goal was reached.
-        perturbations: held-out perturbations as they were used.
-        policy, identity: the policy's name, and what is the same for the same policy alone.
-        settings: what held for all episodes, and what the policy looks at.
-        versions: what computed it, by name: recipes, packages, machine code, content of the benchmark's files, first
-            draws, OpenGL.
+        component: component that was used. It differs from the task's if the scene rejected the first perturbation.
+        episode: name of the episode, a digest of its inputs.
+        seed: seed of the task's perturbations and of random noise.
+        success: True if the goal was reached.
+        reason: reason why the episode ended, see ``Progress``.
+        looks: number of observations.
+        perturbations: held-out perturbations that were used.
+        policy: the policy's name.
+        identity: identity of the policy, equal for equal policies only.
+        settings: settings of all episodes, and the parts of an observation that the policy uses.
+        versions: name to version of everything that computed the result: recipes, packages, machine code, content of
+            the benchmark's files, first perturbations, OpenGL.
     """
 
     episode: str
@@ -62,7 +65,9 @@ class EpisodeResult(EvaluationTask):
 
     @property
     def trial(self) -> Trial:
-        task = EvaluationTask(**{field.name: getattr(self, field.name) for field in fields(EvaluationTask)})
+        """Return the trial of this result."""
+        values = {field.name: getattr(self, field.name) for field in fields(EvaluationTask)}
+        task = EvaluationTask(**values)
         return task, self.seed, json.dumps(self.perturbations, sort_keys=True)
 
 
@@ -71,29 +76,32 @@ _RESULT = TypeAdapter(EpisodeResult)
 
 @dataclass(frozen=True)
 class EpisodeFiles:
-    """``<folder>/episodes/<episode>.json``: a file that exists is complete, so a run goes on where it was killed.
+    """Files of the episodes in a folder.
 
-    ``<folder>/videos/<episode>.mp4`` is there for some, and then before the episode's own file.
+    ``<folder>/episodes/<episode>.json`` is complete if it exists, so a killed run resumes where it stopped. Some
+    episodes have ``<folder>/videos/<episode>.mp4``, which is written before the episode's own file.
     """
 
     folder: Path
 
     def path(self, episode: str) -> Path:
+        """Return the path of an episode's result."""
         return self.folder / "episodes" / f"{episode}.json"
 
     def video(self, episode: str) -> Path:
+        """Return the path of an episode's video."""
         return self.folder / "videos" / f"{episode}.mp4"
 
     def refuse_other_folder(self) -> None:
-        """Reject a folder that has files and no results, such as a checkpoint's, and another program's summary.
+        """Reject a folder with files but without results, such as a checkpoint's, and another program's summary.
 
         Raises:
-            PipelineError: naming the folder or the file.
+            PipelineError: if the folder is rejected; it names the folder or the file.
         """
         refuse_other_file(self.folder / "summary.json", '"by_axis": ')
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
-        # Workers of a cluster have files of their own there; an evaluation without any result has its summary.
+        # Workers of a cluster write log files into the folder. An evaluation without results writes its summary.
         names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
         if set(names) - {"summary.json", LOGS.parts[0]}:
             raise PipelineError(
@@ -104,27 +112,40 @@ class EpisodeFiles:
             )
 
     def save(self, row: EpisodeResult) -> None:
+        """Write the result of an episode."""
         write(self.path(row.episode), json.dumps(asdict(row), sort_keys=True) + "\n")
 
     def row(self, episode: str) -> EpisodeResult | None:
-        """One episode, if it is there."""
+        """Read the result of an episode; return `None` if there is none.
+
+        Raises:
+            PipelineError: if the file is not a result of this version.
+        """
         return _read(self.path(episode)) if self.path(episode).exists() else None
 
     def rows(self) -> list[EpisodeResult]:
-        """All episodes, in the order of their names.
+        """Read the results of all episodes, ordered by episode name.
 
         Raises:
-            PipelineError: when a file is not one of an episode, or of another version of this project.
+            PipelineError: if a file is not the result of an episode, or comes from another version of this project.
         """
         return [_read(path) for path in sorted((self.folder / "episodes").glob("*.json"))]
 
 
 def _read(path: Path) -> EpisodeResult:
+    """Read the result of an episode from a file.
+
+    Raises:
+        PipelineError: if the file is not a result of this version.
+    """
     content = read_json(path, "run the evaluation again")
     try:
         return _RESULT.validate_python(content)
     except ValidationError as error:
-        faults = [f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors()]
+        faults: list[str] = []
+        for fault in error.errors():
+            location = ".".join(map(str, fault["loc"]))
+            faults.append(f"{location}: {fault['msg']}")
         raise PipelineError(
             f"not a result as this version writes it ({'; '.join(faults[:3])})",
             where=path,
@@ -134,58 +155,61 @@ def _read(path: Path) -> EpisodeResult:
 
 
 Stored = tuple[EpisodeResult, EpisodeFiles]
-"""A result, and the files that it is one of."""
+"""Result, and the files of its folder."""
 
 
 def stored(folders: Iterable[Path]) -> list[Stored]:
-    """The results of all folders.
+    """Read the results of all folders.
 
     Raises:
-        PipelineError: when one has none.
+        PipelineError: if a folder has no results.
     """
-    found: list[Stored] = []
+    results: list[Stored] = []
     for files in map(EpisodeFiles, folders):
         rows = files.rows()
         if not rows:
             expected = "a folder that `python -m pipeline evaluate` wrote results into"
             raise PipelineError("no results", where=files.folder, expected=expected)
-        found += [(row, files) for row in rows]
-    return found
+        results += [(row, files) for row in rows]
+    return results
 
 
-def one_setting(found: Sequence[Stored]) -> dict[str, Any]:
-    """What held for all of some results, which are of one policy; empty where there is none.
+def one_setting(results: Sequence[Stored]) -> dict[str, Any]:
+    """Return the settings of results, which must have one policy and one set of settings; empty without results.
 
     Raises:
-        PipelineError: when two are of several policies or settings, with their files and what differs.
+        PipelineError: if two results differ in policy or settings; it names their files and the differences.
     """
     _agree(
-        (("", {"identity": row.identity, **row.settings}, files.path(row.episode)) for row, files in found),
+        (("", {"identity": row.identity, **row.settings}, files.path(row.episode)) for row, files in results),
         "results of several policies or settings",
         expected="one policy under one setting",
         remedy="give each a folder of its own; evaluate a server that has changed under another --label",
     )
-    return found[0][0].settings if found else {}
+    return results[0][0].settings if results else {}
 
 
-def refuse_different(found: Iterable[Stored], across: Collection[str] | None = None) -> None:
-    """Have results that are compared made under one prompt, limit, view and start in each suite of each source.
+def refuse_different(results: Iterable[Stored], across: Collection[str] | None = None) -> None:
+    """Reject results that cannot be compared.
+
+    In each suite of each source, results must have equal prompts, step limits, black views and starts.
 
     Args:
-        across: which of them are what is compared; None where none can be.
+        across: the settings that are compared and so may differ; `None` if the caller offers no such comparison.
 
     Raises:
-        PipelineError: when two were not, with their files and what differs.
+        PipelineError: if two results differ; it names their files and the differences.
     """
 
     def alike(row: EpisodeResult) -> dict[str, object]:
+        """Return the facts that must be equal."""
         settings = {name: row.settings.get(name, default) for name, default in ALIKE.items()}
         facts = {"prompt": row.prompt, "step_limit": row.step_limit, **settings}
         return {name: value for name, value in facts.items() if name not in (across or ())}
 
     choice = "; where the difference is what you compare, --across prompt, --across step_limit or --across black"
     _agree(
-        ((f"{row.source}/{row.suite}", alike(row), files.path(row.episode)) for row, files in found),
+        ((f"{row.source}/{row.suite}", alike(row), files.path(row.episode)) for row, files in results),
         "these results cannot be compared, on ",
         expected="one prompt, one step limit, the same black views and starts for all that is compared",
         remedy=f"evaluate both alike, or leave one of the folders out{'' if across is None else choice}",
@@ -193,13 +217,13 @@ def refuse_different(found: Iterable[Stored], across: Collection[str] | None = N
 
 
 def refuse_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
-    """Have each name mean one policy.
+    """Reject two policies with one name.
 
     Args:
-        policies: name, identity, and the file or folder that results are in or go to.
+        policies: name, identity, and the file or folder of the policy's results.
 
     Raises:
-        PipelineError: when one name has two identities.
+        PipelineError: if one name has two identities.
     """
     _agree(
         ((repr(name), {"identity": identity}, where) for name, identity, where in policies),
@@ -209,18 +233,26 @@ def refuse_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
     )
 
 
-def _agree(found: Iterable[tuple[str, Mapping[str, object], Path]], what: str, expected: str, remedy: str) -> None:
-    """Have facts that go by one name be the same.
+def _agree(
+    named_facts: Iterable[tuple[str, Mapping[str, object], Path]], what: str, expected: str, remedy: str
+) -> None:
+    """Reject different facts under one name.
 
     Args:
-        found: name, facts, and the file that has them.
-        what: is said of two that differ, before their name.
+        named_facts: name, facts, and the file that contains the facts.
+        what: beginning of the error message, before the name.
+
+    Raises:
+        PipelineError: if facts differ; it names the two files and the differences.
     """
-    known: dict[str, tuple[Mapping[str, object], Path]] = {}
-    for name, facts, file in found:
-        earlier, where = known.setdefault(name, (facts, file))
-        both = [(fact, earlier.get(fact), facts.get(fact)) for fact in {**earlier, **facts}]
-        if differing := [f"{fact} {one} and {other}" for fact, one, other in both if one != other]:
+    first_facts: dict[str, tuple[Mapping[str, object], Path]] = {}
+    for name, facts, file in named_facts:
+        earlier, where = first_facts.setdefault(name, (facts, file))
+        differing: list[str] = []
+        for fact in {**earlier, **facts}:
+            if earlier.get(fact) != facts.get(fact):
+                differing.append(f"{fact} {earlier.get(fact)} and {facts.get(fact)}")
+        if differing:
             raise PipelineError(
                 f"{what}{name}: {', '.join(differing)}", where=f"{where} and {file}", expected=expected, remedy=remedy
             )
@@ -228,13 +260,13 @@ def _agree(found: Iterable[tuple[str, Mapping[str, object], Path]], what: str, e
 
 @dataclass(frozen=True)
 class Evaluated:
-    """One policy under one set of settings.
+    """Results of one policy under one set of settings.
 
     Attributes:
-        name: the policy's, with the settings in which it differs from another of the same name.
-        rows: its episodes, without those that no policy acted in.
-        videos: those that there are, by the name of the episode.
-        refused: how many episodes could not begin, as their scene did not take what was drawn.
+        name: the policy's name, with the settings that differ from the policy's other results.
+        rows: the episodes, without those in which no policy acted.
+        videos: name of an episode to its video, for episodes with a video.
+        refused: number of episodes that could not begin, because their scene rejected the perturbation.
     """
 
     name: str
@@ -244,50 +276,51 @@ class Evaluated:
     refused: int
 
     def of(self, source: str) -> list[EpisodeResult]:
-        """Its episodes on the tasks of one source."""
+        """Return the episodes on the tasks of one source."""
         return [row for row in self.rows if row.source == source]
 
 
 def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluated]:
-    """Read the folders that ``evaluate`` wrote; what several of them hold counts once.
+    """Read the folders that ``evaluate`` wrote; an episode in several folders counts once.
 
     Raises:
-        PipelineError: when a folder has no results, results cannot be compared, two results of an episode differ, a
-            task has two episodes under the same settings, or two policies have one name.
+        PipelineError: if a folder has no results, results cannot be compared, two results of an episode differ, a task
+            has two episodes under the same settings, or two policies have one name.
     """
-    found = stored(folders)
-    refuse_shared_names((row.policy, row.identity, files.folder) for row, files in found)
-    refuse_different(found, across)
+    results = stored(folders)
+    refuse_shared_names((row.policy, row.identity, files.folder) for row, files in results)
+    refuse_different(results, across)
+    outcomes: list[tuple[str, Mapping[str, object], Path]] = []
+    for row, files in results:
+        episode_name = f"{row} by {row.policy}, episode {row.episode}"
+        outcome = {"success": row.success, "reason": row.reason, "steps": row.steps}
+        outcomes.append((episode_name, outcome, files.path(row.episode)))
     _agree(
-        (
-            (
-                f"{row} by {row.policy}, episode {row.episode}",
-                {name: getattr(row, name) for name in ("success", "reason", "steps")},
-                files.path(row.episode),
-            )
-            for row, files in found
-        ),
+        outcomes,
         "two results of ",
         expected="one result of each episode, the same wherever it was run",
         remedy="leave one of the folders out; run the one again that other versions of the packages made, or give each "
         "of two policies behind a server a --label of its own",
     )
-    once = [first for first, *_ in grouped((one[0].episode, one) for one in found).values()]
-    evaluated = []
-    for of_policy in grouped((one[0].identity, one) for one in once).values():
-        alike = grouped((digest(one[0].settings), one) for one in of_policy).values()
-        evaluated += [_evaluated(group, [other[0][0] for other in alike]) for group in alike]
+    by_episode = grouped((result[0].episode, result) for result in results)
+    once = [same_episode[0] for same_episode in by_episode.values()]
+    by_policy = grouped((result[0].identity, result) for result in once)
+    evaluated: list[Evaluated] = []
+    for of_policy in by_policy.values():
+        by_settings = grouped((digest(result[0].settings), result) for result in of_policy)
+        first_rows = [group[0][0] for group in by_settings.values()]
+        evaluated += [_evaluated(group, first_rows) for group in by_settings.values()]
     return evaluated
 
 
 def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evaluated:
-    """Results of one policy under one set of settings.
+    """Collect the results of one policy under one set of settings.
 
     Args:
-        alike: an episode of the policy under each of its sets of settings; it has the first of its names.
+        alike: an episode of the policy under each of its sets of settings; the first one gives the policy's name.
 
     Raises:
-        PipelineError: when a task has two episodes.
+        PipelineError: if a task has two episodes.
     """
     acted = [(row, files) for row, files in group if row.reason != REFUSED]
     _agree(
@@ -297,10 +330,13 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
         remedy="move one of the two files into another folder",
     )
     settings = group[0][0].settings
-    differing = [key for key in settings if any(row.settings.get(key) != settings[key] for row in alike)]
+    name_parts = [alike[0].policy]
+    for key, value in settings.items():
+        if any(row.settings.get(key) != value for row in alike):
+            name_parts.append(f"{key.replace('_', ' ')} {value}")
     videos = {row.episode: files.video(row.episode) for row, files in group}
     return Evaluated(
-        name=", ".join([alike[0].policy, *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
+        name=", ".join(name_parts),
         settings=settings,
         rows=[row for row, _ in acted],
         videos={episode: path for episode, path in videos.items() if path.is_file()},

@@ -1,4 +1,4 @@
-"""One episode: a policy acts in an environment until it is over, and the result is stored."""
+"""Rollout of one episode: a policy acts in an environment until the episode is over, and the result is stored."""
 
 import json
 from collections import Counter
@@ -28,41 +28,43 @@ from pipeline.testset import benchmark
 from pipeline.types import Frame
 
 FILM_STEPS = 8
-"""A video has a frame of at most so many steps, also where the policy looks less often, or at nothing."""
+"""Largest number of steps between two frames of a video, even if the policy observes less often or not at all."""
 
 PACKAGES = ("robouse", "opencv-python-headless")
-"""What a result depends on beside the packages of frames: the starter set, and what resizes pictures."""
+"""Packages on which a result depends in addition to the packages of frames: the starter set, and image resizing."""
 
 CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
-"""What computes a checkpoint's actions."""
+"""Packages that compute a checkpoint's actions."""
 
 REMAKE = f"`{identity.REMAKE}=1` before the command; or evaluate into another folder"
-"""How a person allows that results are made anew."""
+"""Remedy that tells a person how to allow that results are generated again."""
 
 RECORDED = ("pipeline", "vla-eval")
-"""The versions of a result that do not decide whether it counts."""
+"""Versions of a result that do not decide whether the result is up to date."""
 
 
 class PolicyConfig(Frozen, use_attribute_docstrings=True):
-    """What acts."""
+    """Configuration of the policy that acts."""
 
     kind: Literal["server", "checkpoint", "open_loop", "tracked"]
     """a model server, a folder that lerobot saved, the demonstrations' own actions, or their paths, followed by
     feedback"""
     address: str = ""
-    """of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations"""
+    """address of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations"""
     label: str = ""
-    """name of the policy in the results. A server must have one, another for each policy: nothing else tells what is
-    behind its address."""
+    """name of the policy in the results. A server must have a label, a different one for each policy, because its
+    address does not identify the policy."""
     timeout_s: float = Field(default=120.0, gt=0)
-    """seconds that a server's answer may take"""
+    """time limit of a server's answer in seconds"""
 
     def identity(self) -> str:
-        """What is the same for the same policy alone: ``sha256:`` and the content of a checkpoint, ``script:`` and the
-        kind of a replay, or ``claimed:`` and the label, where nobody but the user knows.
+        """Return the policy's identity, which is equal for equal policies only.
+
+        The identity is ``sha256:`` and the content of a checkpoint, or ``script:`` and the kind of a replay. For a
+        server it is ``claimed:`` and the label, because only the user knows the policy.
 
         Raises:
-            PipelineError: when a server has no label, or a folder no checkpoint.
+            PipelineError: if a server has no label, or if the folder is not a checkpoint.
         """
         match self.kind:
             case "checkpoint":
@@ -80,11 +82,12 @@ class PolicyConfig(Frozen, use_attribute_docstrings=True):
                 return f"script:{self.kind}"
 
     def name(self, identity: str) -> str:
-        """In the results: the label, or what has this identity."""
+        """Return the policy's name in the results: the label, else a name derived from kind, address and identity."""
         scripts = {"open_loop": "replay", "tracked": "tracked replay"}
         return self.label or scripts.get(self.kind) or f"{self.address} {identity.removeprefix('sha256:')[:8]}"
 
     def open(self, look_every: int) -> Policy:
+        """Load the policy, or connect to its server."""
         match self.kind:
             case "server":
                 return Server(self.address, self.timeout_s, look_every)
@@ -98,12 +101,13 @@ class PolicyConfig(Frozen, use_attribute_docstrings=True):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What holds for all episodes of an evaluation.
+    """Settings, policy and folder of an evaluation, shared by all its episodes.
 
     Attributes:
-        identity: of the policy, as it was when the evaluation began.
-        videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
-        archive: folder of LIBERO-Plus's asset archive, where there is one.
+        identity: identity of the policy when the evaluation began.
+        videos: episodes of which a video is kept, among those that this evaluation runs. A video shows the policy's
+            observations and the end of the episode.
+        archive: folder of LIBERO-Plus's asset archive, if there is one.
     """
 
     settings: EpisodeSettings
@@ -115,49 +119,58 @@ class Evaluation:
 
     @property
     def files(self) -> EpisodeFiles:
+        """Return the files of the evaluation's folder."""
         return EpisodeFiles(self.folder)
 
     def episode(self, task: EvaluationTask) -> str:
-        """Names an episode by what it is made from."""
+        """Compute the name of an episode, a digest of its inputs."""
         return digest("evaluation", asdict(task), self.settings.model_dump(), self.identity)[:16]
 
     def result(self, task: EvaluationTask) -> EpisodeResult | None:
-        """What is stored of an episode, if this version would make the same."""
+        """Return the stored result of an episode if it is up to date, else `None`."""
         row = self.files.row(self.episode(task))
         return row if row is not None and _deciding(row) == self.versions(task) else None
 
     def check(self, tasks: Iterable[EvaluationTask]) -> None:
-        """Refuse a folder that has another policy of this name, or results of other versions that nobody allowed to
-        make anew, or files of another kind.
+        """Reject a folder that this evaluation must not write into.
 
         Raises:
-            PipelineError: when it has. Nothing was changed.
+            PipelineError: if the folder has files of another kind, or results of another policy with this name, or
+                results of other versions that nobody allowed to generate again. No file is changed.
         """
         self.files.refuse_other_folder()
-        known = [(row.policy, row.identity, self.folder) for row in self.files.rows()]
-        refuse_shared_names([*known, (self.policy.name(self.identity), self.identity, self.folder)])
-        rows = ((task, self.files.row(self.episode(task))) for task in tasks)
-        differing = (_differences(_deciding(row), self.versions(task)) for task, row in rows if row is not None)
-        outdated = Counter(f"episodes, made with {reason}" for reason in differing if reason)
+        policies = [(row.policy, row.identity, self.folder) for row in self.files.rows()]
+        refuse_shared_names([*policies, (self.policy.name(self.identity), self.identity, self.folder)])
+        outdated: Counter[str] = Counter()
+        for task in tasks:
+            row = self.files.row(self.episode(task))
+            reason = "" if row is None else _differences(_deciding(row), self.versions(task))
+            if reason:
+                outdated[f"episodes, made with {reason}"] += 1
         identity.refuse_unasked(outdated, self.folder, REMAKE)
 
     def versions(self, task: EvaluationTask) -> dict[str, str]:
-        """What makes a result beside the task, the settings and the policy, by name."""
-        packages = (*PACKAGES, *(CHECKPOINT_PACKAGES if self.policy.kind == "checkpoint" else ()))
-        found = {**identity.made_with("pixels"), **identity.made_with("evaluation"), **_installed(packages)}
-        found["OpenGL"] = gl.choose().device
+        """Return name to version of everything that decides a result besides task, settings and policy."""
+        packages = (*PACKAGES, *CHECKPOINT_PACKAGES) if self.policy.kind == "checkpoint" else PACKAGES
+        versions = {**identity.made_with("pixels"), **identity.made_with("evaluation"), **_installed(packages)}
+        versions["OpenGL"] = gl.choose().device
         if task.source == "libero_plus":
             contents = libero_plus.contents(benchmark.load().find(task.suite, task.name), self.archive)
-            found |= {"files of the benchmark": digest(contents)[:16]} if contents else {}
+            if contents:
+                versions["files of the benchmark"] = digest(contents)[:16]
         if task.source == "own":
-            found["draws"] = own_draws.first_draws(task, self.settings.seed)
-        return found
+            versions["draws"] = own_draws.first_draws(task, self.settings.seed)
+        return versions
 
     def save(self, environment: EpisodeEnvironment, wanted: Wanted) -> None:
-        """Write the result of the episode that ended in an environment, of a policy that asked to see ``wanted``."""
+        """Write the result of the episode that ended in an environment.
+
+        Args:
+            wanted: the parts of an observation that the policy asked for.
+        """
         task, progress = environment.task, environment.progress
-        own = environment.perturbations if task.source == "own" else ()
-        component = "+".join(change.component for change in own) or task.component
+        held_out = environment.perturbations if task.source == "own" else ()
+        component = "+".join(perturbation.component for perturbation in held_out) or task.component
         self.files.save(
             EpisodeResult(
                 **asdict(task) | {"component": component},
@@ -170,7 +183,7 @@ class Evaluation:
                 reason=progress.reason,
                 steps=progress.steps,
                 looks=environment.looks,
-                perturbations=json.loads(to_json(own)),
+                perturbations=json.loads(to_json(held_out)),
                 policy=self.policy.name(self.identity),
                 identity=self.identity,
                 settings={**self.settings.model_dump(), **wanted._asdict()},
@@ -184,42 +197,46 @@ class Evaluation:
 
 
 def _deciding(row: EpisodeResult) -> dict[str, str]:
+    """Return the versions that decide whether a result is up to date."""
     return {name: value for name, value in row.versions.items() if name not in RECORDED}
 
 
 def _differences(then: dict[str, str], now: dict[str, str]) -> str:
-    """See ``identity.differences``; in the same words for all tasks."""
-    own = [f"other {name}" for name in PER_TASK if then.get(name) != now.get(name)]
-    common = [{name: value for name, value in each.items() if name not in PER_TASK} for each in (then, now)]
-    return ", ".join(filter(None, [*own, identity.differences(*common)]))
+    """Describe the differences of versions like ``identity.differences``, in equal words for all tasks."""
+    per_task = [f"other {name}" for name in PER_TASK if then.get(name) != now.get(name)]
+    common_then = {name: value for name, value in then.items() if name not in PER_TASK}
+    common_now = {name: value for name, value in now.items() if name not in PER_TASK}
+    return ", ".join(filter(None, [*per_task, identity.differences(common_then, common_now)]))
 
 
 @cache
 def _installed(packages: tuple[str, ...]) -> dict[str, str]:
-    found = {}
+    """Return package to version, for packages that are installed."""
+    versions = {}
     for package in packages:
         with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
+            versions[package] = version(package)
+    return versions
 
 
 def roll_out_policy(
     environment: EpisodeEnvironment, policy: Policy, task: EvaluationTask, film: dict[int, Frame] | None = None
 ) -> None:
-    """Run one episode to its end, which the environment knows.
+    """Run one episode to its end; the environment has the result.
 
     Args:
-        film: where agent views go, by the number of steps before each: of every look, and one whenever
-            ``FILM_STEPS`` went by without a look at it.
+        film: dictionary that receives agent views: number of steps before a view to the view. It receives the view of
+            every observation, and a view after each ``FILM_STEPS`` steps without an observation.
 
     Raises:
-        PolicyError: when the policy answers with anything but actions.
-        PipelineError: when the task cannot be rebuilt.
+        PolicyError: if the policy's answer is not actions.
+        PipelineError: if the task cannot be rebuilt.
     """
     progress = environment.reset(task)
     policy.begin(task)
 
     def look(wanted: Wanted) -> dict[str, Any]:
+        """Return an observation, and add its agent view to the film."""
         observation = environment.observation(wanted)
         if film is not None and wanted.images:
             film[environment.progress.steps] = observation["images"]["agentview"]

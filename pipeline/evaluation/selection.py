@@ -1,8 +1,9 @@
-"""Which tasks to evaluate on: those that a user names, or a benchmark made as LIBERO-Plus was.
+"""Selection of the tasks to evaluate on: tasks that a user names, or a benchmark constructed like LIBERO-Plus.
 
-LIBERO-Plus drew 500 candidates of each of its seven dimensions in each of four suites, filtered them, and balanced them
-to 10,030. Here the seven are this project's axes with held-out perturbations that the benchmark tests: its layout is
-the axes layout and pose, and language has none.
+LIBERO-Plus sampled 500 candidates of each of its seven dimensions in each of four suites, filtered them, and balanced
+them to 10,030 tasks. Here, this project's axes with held-out perturbations take the place of the seven dimensions, if
+the benchmark tests them. LIBERO-Plus's layout corresponds to the axes layout and pose. Language has no held-out
+perturbations.
 """
 
 import difflib
@@ -28,62 +29,65 @@ from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Task
 
 INITIAL_STATES = 50
-"""LIBERO's, of each task."""
+"""Number of LIBERO's initial states per task."""
 
 COLUMNS = {"suites": "suite", "axes": "axis", "components": "component", "levels": "level"}
-"""Fields of a selection to what they restrict."""
+"""Field of a selection to the field of a task that it restricts."""
 
 PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
-"""The six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
+"""Axes of the six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
 
 CANDIDATES = 500
-"""Of each axis in each suite, spread evenly over tasks and levels."""
+"""Number of candidates of each axis in each suite, spread evenly over tasks and levels."""
 
 SIZE = 10_000
-"""How many tasks the benchmark has; LIBERO-Plus has 10,030."""
+"""Number of tasks in the benchmark; LIBERO-Plus has 10,030."""
 
 
 class Selection(Frozen, use_attribute_docstrings=True):
-    """Which tasks to evaluate on; what is left out does not restrict."""
+    """Selection of tasks; a field that is left out does not restrict it."""
 
     source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
     """LIBERO's tasks; LIBERO-Plus's test tasks; held-out perturbations on this project's axes (``own``); LIBERO's tasks
     asked for another object of their scene (``goals``); for every two axes LIBERO's task, a held-out perturbation on
     either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
-    """in place of a source, a list of tasks that ``analyse construct`` wrote"""
+    """list of tasks that ``analyse construct`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES
-    """of these suites only"""
+    """only these suites"""
     axes: tuple[str, ...] = ()
-    """of these axes only"""
+    """only these axes"""
     components: tuple[str, ...] = ()
-    """of these components only"""
+    """only these components"""
     levels: tuple[int, ...] = ()
-    """of these levels only"""
+    """only these levels"""
     tasks: tuple[str, ...] = ()
-    """shell-style patterns, one of which must match the task's name or its LIBERO task's"""
+    """shell-style patterns, one of which must match the name of the task or of its LIBERO task"""
     episodes: int = Field(default=1, ge=1)
-    """how many of LIBERO's 50 initial states of each task, or, of ``own``, perturbations of each task, axis and level;
-    from the 51st on they are on the same initial states again"""
+    """number of LIBERO's 50 initial states per task; for ``own``, number of perturbations per task, axis and level,
+    whose initial states repeat from the 51st on"""
     subset: int | None = Field(default=None, ge=1)
-    """at most so many, spread evenly over suites, axes, components and levels"""
+    """largest number of tasks, spread evenly over suites, axes, components and levels"""
     seed: int = 0
-    """of the subset and of all perturbations"""
+    """seed of the subset and of all perturbations"""
 
 
 def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
-    """The tasks that a selection names, in a fixed order.
+    """Return the selected tasks in a fixed order.
 
     Raises:
-        PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.
+        PipelineError: if the selection names something unknown, matches no task, or needs the benchmark's asset
+            archive.
     """
     _check_names(selection)
     listed = list(_listed(selection))
-    if selection.source == "pairs":  # which are listed by axis and level, and with LIBERO's tasks, which have neither
+    if selection.source == "pairs":
+        # Pairs are already restricted by axis and level. They include LIBERO's tasks, which have neither.
         selection = selection.model_copy(update={"axes": (), "levels": ()})
     _check_listed(selection, listed)
     wanted = [task for task in listed if _matches(task, selection)]
-    if unknown := _of_unknown_level(listed, selection):
+    unknown = _of_unknown_level(listed, selection)
+    if unknown:
         counts = ", ".join(f"{axis} {count}" for axis, count in unknown.items())
         print(f"left out, because the parameters do not tell their level (0): {counts}")
     if selection.source == "libero_plus" and selection.file is None:
@@ -94,7 +98,11 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
 
 
 def _check_names(selection: Selection) -> None:
-    """Refuse what can be refused before anything is listed."""
+    """Reject errors in a selection that do not depend on the listed tasks.
+
+    Raises:
+        PipelineError: if the selection is rejected.
+    """
     # The benchmark leaves LIBERO-90 out.
     of_benchmark = selection.source == "libero_plus" and selection.file is None
     _check_known("suites", selection.suites, TESTED_SUITES if of_benchmark else SUITES, selection)
@@ -126,7 +134,8 @@ def _check_names(selection: Selection) -> None:
         )
     if selection.source in ("own", "pairs"):
         for axis in selection.axes:
-            if axis in AXES and (reason := AXES[axis].not_held_out):
+            reason = AXES[axis].not_held_out if axis in AXES else ""
+            if reason:
                 raise PipelineError(
                     f"{axis} has no held-out perturbations: {reason}",
                     where="axes",
@@ -137,16 +146,23 @@ def _check_names(selection: Selection) -> None:
         _check_known("levels", selection.levels, LEVELS, selection)
 
 
-def _check_known(field: str, named: Iterable[object], known: Collection[object], selection: Selection) -> None:
-    if unknown := [name for name in named if name not in known]:
+def _check_known(field: str, named: Iterable[object], valid: Collection[object], selection: Selection) -> None:
+    """Reject values of a field that are not valid.
+
+    Raises:
+        PipelineError: if there is such a value; it names the first one and the valid values.
+    """
+    unknown = [name for name in named if name not in valid]
+    if unknown:
         raise PipelineError(
             f"{selection.file or selection.source} has no {unknown[0]!r}",
             where=field,
-            expected=" or ".join(str(name) for name in sorted(known, key=str)),
+            expected=" or ".join(str(name) for name in sorted(valid, key=str)),
         )
 
 
 def _listed(selection: Selection) -> Iterator[EvaluationTask]:
+    """Yield the tasks of the selection's source, before the other fields restrict them."""
     if selection.file is not None:
         yield from read_tasks(selection.file, selection.seed)
         return
@@ -155,8 +171,10 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
             named = test.suite, test.base, test.name
             yield EvaluationTask("libero_plus", *named, test.axis, test.component, level_of_test(test), 0)
         return
-    every = [(place, task) for suite in selection.suites for place, task in enumerate(tasks(suite))]
-    for place, task in every:
+    numbered_tasks: list[tuple[int, Task]] = []
+    for suite in selection.suites:
+        numbered_tasks += enumerate(tasks(suite))
+    for place, task in numbered_tasks:
         for number in range(selection.episodes):
             match selection.source:
                 case "libero":
@@ -174,26 +192,30 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
 
 
 def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator[EvaluationTask]:
-    """All combinations of none, one and two axes on one initial state, at one level.
+    """Yield all combinations of no axis, one axis and two axes on one initial state, at one level.
 
     Args:
-        turn: place of the task in its suite and number of the state, added: which of the levels it is.
+        turn: sum of the task's place in its suite and the state's number; it selects the level.
     """
     levels, axes = selection.levels or LEVELS, axes_of("+".join(selection.axes or PAIR_AXES))
-    pairs = ("+".join(pair) for pair in combinations(axes, 2))
+    pairs = ["+".join(pair) for pair in combinations(axes, 2)]
     level = levels[turn % len(levels)]
     yield libero_task(task, number)
-    yield from filter(None, (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs)))
+    for axis in (*axes, *pairs):
+        drawn = drawn_task(task, axis, level, number, selection.seed)
+        if drawn is not None:
+            yield drawn
 
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
-    named = not selection.tasks or any(fnmatch.filter((task.name, task.base), one) for one in selection.tasks)
+    """Return whether a task matches the names and the other restrictions of a selection."""
+    named = not selection.tasks or any(fnmatch.filter((task.name, task.base), pattern) for pattern in selection.tasks)
     asked = {column: getattr(selection, field) for field, column in COLUMNS.items()}
     return named and all(not values or getattr(task, column) in values for column, values in asked.items())
 
 
 def _of_unknown_level(listed: Sequence[EvaluationTask], selection: Selection) -> Counter[str]:
-    """Axis to the number of perturbed tasks that match but for their level, which is unknown."""
+    """Count, for each axis, the perturbed tasks with an unknown level that match apart from their level."""
     if not selection.levels or 0 in selection.levels:
         return Counter()
     at_any = selection.model_copy(update={"levels": ()})
@@ -202,11 +224,19 @@ def _of_unknown_level(listed: Sequence[EvaluationTask], selection: Selection) ->
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
+    """Reject restrictions that no listed task has.
+
+    Raises:
+        PipelineError: if an axis, a component, a level or a pattern of names matches no task.
+    """
     for field in ("axes", "components", "levels"):
-        known = {getattr(task, COLUMNS[field]) for task in listed}
-        _check_known(field, getattr(selection, field), known, selection)
-    names = {name for task in listed for name in (task.name, task.base)}
-    names |= {task.name for suite in SUITES for task in tasks(suite)}
+        values = {getattr(task, COLUMNS[field]) for task in listed}
+        _check_known(field, getattr(selection, field), values, selection)
+    names: set[str] = set()
+    for task in listed:
+        names |= {task.name, task.base}
+    for suite in SUITES:
+        names |= {task.name for task in tasks(suite)}
     for pattern in selection.tasks:
         if not fnmatch.filter(names, pattern):
             closest = difflib.get_close_matches(pattern, names, cutoff=0)
@@ -214,22 +244,28 @@ def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> Non
 
 
 def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> PipelineError:
-    """What there is of each restriction among the tasks that keep to all others."""
-    there = []
+    """Return an error that lists, for each restriction, the values that would still match the other restrictions."""
+    alternatives: list[str] = []
     for field, column in COLUMNS.items():
         if getattr(selection, field):
-            others = selection.model_copy(update={field: ()})
-            values = {getattr(task, column) for task in listed if _matches(task, others)}
-            there += [f"{field} {' or '.join(str(value) for value in sorted(values))}"] if values else []
+            without_field = selection.model_copy(update={field: ()})
+            values = {getattr(task, column) for task in listed if _matches(task, without_field)}
+            if values:
+                names = " or ".join(str(value) for value in sorted(values))
+                alternatives.append(f"{field} {names}")
     return PipelineError(
         "no task is left",
         where=f"selection {selection.model_dump(mode='json', exclude_defaults=True)}",
-        expected="with the other restrictions as they are, " + "; or ".join(there) if there else None,
+        expected="with the other restrictions as they are, " + "; or ".join(alternatives) if alternatives else None,
     )
 
 
 def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
-    """Those that can be rebuilt; says how many cannot. Refuses an axis of which nothing can be, if it is named."""
+    """Return the tasks that can be rebuilt here, and print how many cannot.
+
+    Raises:
+        PipelineError: if no task can be rebuilt, or no task of an axis that the selection names.
+    """
     left = [task for task in wanted if libero_plus.assets_of(load().find(task.suite, task.name), archive)]
     missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
@@ -247,20 +283,27 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
 
 
 def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
-    """``each`` held-out perturbations on every axis that the benchmark tests, in every suite; no scene is built.
+    """Sample ``each`` held-out perturbations on every axis that the benchmark tests, in every suite.
 
-    The number of a draw counts up once all tasks and levels had one, so initial states differ too.
+    No scene is built.
     """
     drawn: list[EvaluationTask] = []
     tested = [axis for axis in OWN_AXES if load().of(axis)]
     for suite, axis in product(TESTED_SUITES, tested):
-        every = (
-            drawn_task(task, axis, level, number, seed)
-            for number in count()
-            for level, task in product(LEVELS, tasks(suite))
-        )
-        drawn += islice((task for task in every if task is not None), each)
+        drawn += islice(_drawn_tasks(suite, axis, seed), each)
     return drawn
+
+
+def _drawn_tasks(suite: str, axis: str, seed: int) -> Iterator[EvaluationTask]:
+    """Yield a suite's tasks with held-out perturbations on one axis, without end.
+
+    The number of a perturbation increases after all tasks and levels had one, so initial states differ too.
+    """
+    for number in count():
+        for level, task in product(LEVELS, tasks(suite)):
+            drawn = drawn_task(task, axis, level, number, seed)
+            if drawn is not None:
+                yield drawn
 
 
 def construct(
@@ -270,18 +313,18 @@ def construct(
     results: Iterable[EpisodeResult] = (),
     plan: PlannedDraws | None = None,
 ) -> tuple[list[EvaluationTask], dict[str, Any]]:
-    """Filter candidates, and choose some evenly: axes in turn, of each axis its components, then levels, then suites.
+    """Filter candidates, and choose tasks evenly: axes in turn, for each axis its components, then levels, then suites.
 
     Args:
-        results: episodes of candidates that were run; those whose scene was refused are left out.
-        plan: a training plan; candidates whose first draw overlaps with it are left out. Those that follow where a
-            scene refuses it are compared when an evaluation is given the plan.
+        results: episodes of candidates that were run; candidates whose scene was rejected are left out.
+        plan: a training plan; candidates whose first perturbation overlaps with it are left out. If the scene rejects
+            the first perturbation, the next ones are compared when an evaluation gets the plan.
 
     Returns:
-        The benchmark's tasks, and how many there are of each kind, JSON-serialisable, with those that were left out.
+        The benchmark's tasks, and the numbers of tasks and of left-out candidates by kind, JSON-serialisable.
 
     Raises:
-        PipelineError: when a result is of another seed, whose draws are others under the same names.
+        PipelineError: if a result has another seed, because its perturbations differ under equal names.
     """
     refused = set()
     for row in results:
@@ -291,15 +334,15 @@ def construct(
             )
         if row.reason == REFUSED:
             refused.add(str(row))
-    there = [task for task in drawn if str(task) not in refused]
-    apart = there
+    accepted = [task for task in drawn if str(task) not in refused]
+    apart = accepted
     if plan is not None:
-        apart = [task for task in there if not plan.overlap(draw(task, seed), find_task(task.suite, task.base))]
+        apart = [task for task in accepted if not plan.overlap(draw(task, seed), find_task(task.suite, task.base))]
     chosen = balanced(apart, size, seed)
     return chosen, {
         "candidates": len(drawn),
-        "refused": len(drawn) - len(there),
-        "overlapping": len(there) - len(apart),
+        "refused": len(drawn) - len(accepted),
+        "overlapping": len(accepted) - len(apart),
         "tasks": len(chosen),
         "by_axis": dict(sorted(Counter(task.axis for task in chosen).items())),
         "by_component": dict(sorted(Counter(f"{task.axis}/{task.component}" for task in chosen).items())),

@@ -1,4 +1,4 @@
-"""LIBERO's environment of one task, started and observed as policies are evaluated in it, and kept between episodes."""
+"""Simulator of one task for the evaluation of policies, reused between episodes, and the renderer of its scenes."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -21,30 +21,31 @@ from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
 
 SETTLING_STEPS = 10
-"""Control steps before the policy's first look, while objects fall into place (OpenVLA's and LIBERO-Plus's rule)."""
+"""Number of control steps before the first observation, in which objects settle (OpenVLA's and LIBERO-Plus's rule)."""
 
 OBSERVED = 24
-"""The substep, of the 25 of a control step, that robosuite 1.4.0 observes.
+"""Number of the substep, among the 25 of a control step, that robosuite 1.4.0 observes.
 
-An observable samples once in 50 ms, by a timer that counts every update. A reset and LIBERO's ``set_init_state`` force
-one update each, so the timer is two substeps ahead, and the 24th is observed, not the last: the policy sees the arm 2
-to 4 ms earlier than where it is (``Observable.update`` in ``robosuite/utils/observables.py``). An ``Observable`` that
-was updated twice observed the 24th in each of 20,000 control steps.
+An observable samples once per 50 ms, by a timer that counts every update. A reset and LIBERO's ``set_init_state`` force
+one update each, so the timer is two substeps ahead. Therefore the 24th substep is observed, not the last. The
+policy sees a state of the arm that is 2 to 4 ms old. Source: ``Observable.update`` in
+``robosuite/utils/observables.py``. In a test, an ``Observable`` that was updated twice observed the 24th substep in
+each of 20,000 control steps.
 """
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class Observed(NamedTuple):
-    """What LIBERO's observation of one control step was taken from.
+    """Simulator values of LIBERO's observation of one control step.
 
     Attributes:
-        qpos: (nq,) positions that frames show.
-        site_alpha: (nsite,) opacity of each site in them.
+        qpos: (nq,) positions in the frames.
+        site_alpha: (nsite,) opacity of each site in the frames.
         state: (8,) float32 position (m) and axis-angle (rad) of the end effector and two finger joints (m).
         joint_state: (7,) float32 joint angles in rad.
         hand_wxyz: (4,) orientation of the hand, which ``state`` has as an axis-angle.
-        velocity: (9,) of the joints (rad/s) and the two finger joints (m/s).
+        velocity: (9,) velocities of the joints (rad/s) and of the two finger joints (m/s).
     """
 
     qpos: Floats
@@ -56,7 +57,7 @@ class Observed(NamedTuple):
 
 
 class _Rewind(NamedTuple):
-    """All that a reset leaves behind and an episode changes; ``physics`` has where the solver starts, too."""
+    """Result of a reset, as far as episodes change it; ``physics`` includes the start values of the solver."""
 
     seed: int
     posture_rad: tuple[float, ...] | None
@@ -66,39 +67,39 @@ class _Rewind(NamedTuple):
 
 
 class Simulator(Environment):
-    """An environment in which episodes start in one of two ways, then settle.
+    """Environment in which an episode starts from a reset or from a scene, and then settles.
 
-    The model is the one that LIBERO's own reset compiles, not one read back from MJCF, so that states and frames are
-    those of LIBERO's evaluation. A reset takes 1.3 s; episodes with the same seed and posture share one.
+    LIBERO's own reset compiles the model, so states and frames equal those of LIBERO's evaluation. A model that is read
+    from MJCF would differ. A reset takes 1.3 s; episodes with equal seed and posture share a reset.
 
     Args:
-        files: of the arena, by absolute paths; the task's own by default.
+        files: files of the arena, by absolute paths; the task's own by default.
     """
 
     def __init__(self, task: Task, files: SceneFiles | None = None):
-        own = () if files is None else (_styles({"floor": files.floor, "wall": files.wall}), files.scene_xml)
-        super().__init__(task, *own)
+        arena = () if files is None else (_styles({"floor": files.floor, "wall": files.wall}), files.scene_xml)
+        super().__init__(task, *arena)
         self._rewind: _Rewind | None = None
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The model that LIBERO's last reset compiled, textures included."""
+        """Return the model that LIBERO's last reset compiled, including textures."""
         return self._env.sim.model._model
 
     @property
     def controller(self) -> Any:
-        """robosuite's, of the arm."""
+        """Return robosuite's controller of the arm."""
         return self._env.env.robots[0].controller
 
     def start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
-        """Reset, put in an initial state and settle, as the benchmarks' evaluations do.
+        """Reset, set an initial state and settle, as in the benchmarks' evaluations.
 
         Args:
-            seed: of numpy's global generator while LIBERO resets, which places what is not part of the state: the
-                fixtures.
+            seed: seed of numpy's global generator during LIBERO's reset. The reset places the fixtures, which are not
+                part of the state.
             state: (S,) flattened MuJoCo state: time, qpos, qvel.
-            posture_rad: (7,) where the reset puts the arm; LIBERO's own by default. The state puts the arm elsewhere
-                at once, but the controller keeps the goal orientation and the null-space posture of the reset, and
+            posture_rad: (7,) joint angles of the arm in the reset; LIBERO's own by default. The state moves the arm
+                at once. But the controller keeps the goal orientation and the null-space posture of the reset, and
                 drives the arm to them.
         """
         env = self._env.env
@@ -120,18 +121,19 @@ class Simulator(Environment):
         self.settle(SETTLING_STEPS)
 
     def start_scene(self, scene: Scene) -> None:
-        """Restore a scene that does not come from LIBERO's reset, such as a perturbed one, and settle."""
+        """Restore a scene that does not come from LIBERO's reset, such as a perturbed scene, and settle."""
         self._rewind = None
         self.restore(scene)
         self._observe_from_here()
         self.settle(SETTLING_STEPS)
 
     def place_fixtures(self, seed: int) -> str:
-        """See ``Environment``; what ``start`` kept of its reset goes."""
+        """Place the fixtures, see ``Environment``, and discard the reset that ``start`` kept."""
         self._rewind = None
         return super().place_fixtures(seed)
 
     def _reset(self, seed: int, posture_rad: tuple[float, ...] | None) -> None:
+        """Reset LIBERO's environment, and keep the result for later episodes."""
         env = self._env.env
         self._reset_under(seed, initial_qpos=None if posture_rad is None else np.array(posture_rad))
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
@@ -140,16 +142,17 @@ class Simulator(Environment):
         self._rewind = _Rewind(seed, posture_rad, physics, env.sim.model.site_rgba.copy(), controller)
 
     def _observe_from_here(self) -> None:
+        """Begin a new control step at the current state, and observe this state."""
         env = self._env.env
         self._control_step = ControlStep(env)
         self.observed = self._observe(env.sim.data.qpos.copy())
 
     def step(self, action: Floats) -> None:
-        """Run one control step (50 ms), and keep what LIBERO observes of it in ``observed``.
+        """Run one control step (50 ms), and store LIBERO's observation of it in ``observed``.
 
         Raises:
-            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with, also where
-                MuJoCo has reset the scene by itself because of that.
+            RefusedError: ``simulation_unstable`` if numbers grow too large to compute with, and if MuJoCo has reset the
+                scene because of such numbers.
         """
         data = self._env.sim.data._data
         qpos = data.qpos.copy()
@@ -161,7 +164,11 @@ class Simulator(Environment):
                 qpos = data.qpos.copy()
 
     def _observe(self, qpos: Floats) -> Observed:
-        """Args: qpos: (nq,) that the data's geometry was computed from, one substep before the data's own."""
+        """Return the observation of the current geometry.
+
+        Args:
+            qpos: (nq,) positions from which the data's geometry was computed, one substep before the data's own.
+        """
         data, names = self._env.sim.data._data, (*ARM, *FINGERS)
         velocity = np.concatenate([data.joint(name).qvel for name in names])
         hand_wxyz = data.body("robot0_right_hand").xquat.copy()
@@ -169,11 +176,12 @@ class Simulator(Environment):
 
 
 def _styles(images: Mapping[str, str]) -> dict[str, str]:
-    """``scene_properties`` for images, which LIBERO looks for where its arena has the image that they replace.
+    """Register images with LIBERO, and return the ``scene_properties`` that select them.
 
-    LIBERO finds them by its own names for them, and has no name for some.
+    LIBERO searches an image in the folder of the arena's image that it replaces. LIBERO finds images by style names and
+    has no style name for some images, so each image gets a name.
     """
-    control_env()  # which takes care of how it is imported
+    control_env()  # imports LIBERO in the right way
     from libero.libero.envs.arenas.style import STYLE_MAPPING
 
     for part, image in images.items():
@@ -182,11 +190,12 @@ def _styles(images: Mapping[str, str]) -> dict[str, str]:
 
 
 def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Copy attributes, including their arrays."""
     return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in attributes.items()}
 
 
 class Picture:
-    """Renders one scene after the other; episodes of the same meshes and textures share an OpenGL context."""
+    """Renderer of one scene after the other; episodes with equal meshes and textures share an OpenGL context."""
 
     def __init__(self) -> None:
         self._opened = LastScene()
@@ -196,20 +205,24 @@ class Picture:
 
     @property
     def opened(self) -> LastScene:
-        """What renders; an episode's looks must be undone before another scene is asked for."""
+        """Return the renderer; call ``restore`` before another scene is rendered with it."""
         return self._opened
 
     def show(self, scene: mujoco.MjModel | str, perturbations: Sequence[Perturbation]) -> None:
-        """Render from here on a model, or a scene's MJCF where the model is without its images, as it is perturbed."""
+        """Set the scene and the perturbations that ``frame`` renders.
+
+        Args:
+            scene: a model, or the scene's MJCF if the model has no textures.
+        """
         self.restore()
         self._scene, self._perturbations = scene, perturbations
 
     def frame(self, view: str, observed: Observed, step: int) -> Frame:
-        """(256, 256, 3) uint8 RGB, turned by 180 degrees.
+        """Render a (256, 256, 3) uint8 RGB image, turned by 180 degrees.
 
         Args:
-            view: its name in ``schemas/episode.json``.
-            step: how many steps were taken, for noise that is random.
+            view: name of the view in ``schemas/episode.json``.
+            step: number of steps taken, for random noise.
         """
         renderer, stream = self._opened.renderer(self._scene), Stream(view, tuple(self._perturbations))
         if self._changes is None:
@@ -219,11 +232,12 @@ class Picture:
         return frames_of(renderer, state, observed.site_alpha, [stream], step)[0]
 
     def restore(self) -> None:
-        """Undo an episode's looks."""
+        """Undo an episode's render perturbations."""
         if self._changes is not None:
             self._changes.close()
         self._changes = None
 
     def close(self) -> None:
+        """Close the renderer."""
         self.show("", ())
         self._opened.close()

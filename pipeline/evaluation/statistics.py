@@ -1,18 +1,21 @@
-"""The statistics of an evaluation: success rates with their intervals, and differences by bootstrap (Efron, 1979).
+"""Statistics of an evaluation: success rates with their intervals, and differences by bootstrap (Efron, 1979).
 
-What is compared is of the same trials: a test task that two policies act in, or an initial state on which the four
-combinations of two axes were run. A trial's outcomes stay together, so what makes it easy or hard for all of them
-cancels. Trials of one base task are alike, so it matters what is drawn anew:
+Comparisons use outcomes of common trials. A trial is a test task in which two policies act, or an initial state on
+which the four combinations of two axes were run. The bootstrap keeps a trial's outcomes together, so the difficulty of
+the trial, which affects all its outcomes, cancels. Trials of one base task are correlated, so the choice of the units
+that are resampled matters:
 
-* With ``SAMPLE`` base tasks or more these are a sample, and are drawn, each with all its trials. The interval says what
-  other tasks of this kind would show. Trials are not drawn again within the drawn tasks: their scatter would count
-  twice, and simulated intervals of five trials a task cover 97.8 to 99.5 %.
-* Fewer are fixed: trials are drawn within each of them, and the interval is about these tasks alone. They tell too
-  little of others: simulated, a plain bootstrap that draws four base tasks anew covers 73 to 97 % instead of 95 %.
-* Where some base task has fewer than ``FEW`` trials, all trials are drawn as if of one. This is wider.
+* With ``SAMPLE`` base tasks or more, the base tasks are a sample. The bootstrap resamples base tasks, each with all its
+  trials, and the interval generalises to other tasks of this kind. Trials are not resampled within the base tasks,
+  because their scatter would count twice: simulated intervals of five trials per task cover 97.8 to 99.5 %.
+* Fewer base tasks are fixed. The bootstrap resamples trials within each base task, and the interval is about these
+  tasks alone. Few base tasks tell too little about other tasks: simulated, a plain bootstrap that resamples four base
+  tasks covers 73 to 97 % instead of 95 %.
+* If a base task has fewer than ``FEW`` trials, the bootstrap resamples all trials as if they had one base task. The
+  interval is wider.
 
-Of n units n - 1 are drawn, which makes the variance of a mean unbiased (Rao and Wu, 1988). The percentiles are not 2.5
-and 97.5 but further out, by as much as Student's t is wider than the normal distribution (Hesterberg, 2015).
+The bootstrap samples n - 1 of n units, which makes the variance of a mean unbiased (Rao and Wu, 1988). The percentiles
+are not 2.5 and 97.5. They are further out, as Student's t is wider than the normal distribution (Hesterberg, 2015).
 """
 
 import math
@@ -29,18 +32,21 @@ from scipy.stats import binomtest, norm, t
 from pipeline import seeding
 from pipeline.errors import PipelineError
 from pipeline.evaluation.own_draws import drawn_task
-from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
+from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, Trial, one_setting, refuse_different
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
 from pipeline.types import Floats
 
 GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
-"""What success rates are given by, beside the whole."""
+"""Columns by which success rates are grouped, in addition to the total rate."""
 
 
 def wilson(successes: float, trials: float) -> tuple[float, float]:
-    """The 95 % interval of a success rate (Wilson, 1927); it holds for few trials and for rates near 0 and 1."""
+    """Compute the 95 % interval of a success rate (Wilson, 1927).
+
+    The interval is valid for few trials and for rates near 0 and 1.
+    """
     if trials == 0:
         return 0.0, 1.0
     rate, z = successes / trials, float(norm.ppf(0.975))
@@ -51,21 +57,29 @@ def wilson(successes: float, trials: float) -> tuple[float, float]:
 
 
 def summary(rows: Iterable[EpisodeResult]) -> dict[str, Any]:
-    """Success as a whole and by each of ``GROUPINGS``; a group's key joins its values by ``/``.
+    """Compute the total success rate and the rates by each of ``GROUPINGS``; a group's key joins its values by ``/``.
 
-    Episodes whose scene was refused are only counted, as no policy acted in them.
+    Episodes whose scene was rejected are only counted, because no policy acted in them.
     """
     every = list(rows)
-    listed = [row for row in every if row.reason != REFUSED]
-    found: dict[str, Any] = {"all": success_rate(listed), "refused": len(every) - len(listed)}
+    acted = [row for row in every if row.reason != REFUSED]
+    rates: dict[str, Any] = {"all": success_rate(acted), "refused": len(every) - len(acted)}
     for columns in GROUPINGS:
-        groups = grouped(("/".join(str(getattr(row, column)) for column in columns), row) for row in listed)
-        found["by_" + "_and_".join(columns)] = {name: success_rate(groups[name]) for name in sorted(groups)}
-    return found
+        groups = grouped((_group_name(row, columns), row) for row in acted)
+        rates["by_" + "_and_".join(columns)] = {name: success_rate(groups[name]) for name in sorted(groups)}
+    return rates
+
+
+def _group_name(row: EpisodeResult, columns: Sequence[str]) -> str:
+    """Join a result's values of some columns by ``/``."""
+    return "/".join(str(getattr(row, column)) for column in columns)
 
 
 def success_rate(rows: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """``episodes``, ``successes``, their ``rate`` (None without episodes), and the interval's ``low`` and ``high``."""
+    """Return ``episodes``, ``successes``, their ``rate`` (`None` without episodes), and the interval's bounds.
+
+    The bounds are ``low`` and ``high``, rounded to four decimals.
+    """
     successes = sum(row.success for row in rows)
     low, high = wilson(successes, len(rows))
     rate = successes / len(rows) if rows else None
@@ -73,24 +87,26 @@ def success_rate(rows: Sequence[EpisodeResult]) -> dict[str, Any]:
 
 
 SAMPLE = 10
-"""So many base tasks are a sample. Simulated, intervals of ten cover 94 to 96 % (``test_bootstrap.py``)."""
+"""Least number of base tasks that are a sample. Simulated intervals of ten cover 94 to 96 % (``test_bootstrap.py``)."""
 
 FEW = 5
-"""Fewer trials of a base task say too little about how they scatter."""
+"""Least number of trials of a base task from which their scatter can be estimated."""
 
 RESAMPLES = 10_000
 
 Statistic = Callable[[Floats], Floats]
-"""Sums of outcomes over trials (n, outcomes) to n figures; NaN where one is not defined."""
+"""Function from sums of outcomes over trials (n, outcomes) to (n,) figures; undefined figures are NaN."""
 
 
 class Interval(NamedTuple):
-    """The 95 % interval of a figure.
+    """95 % interval of a figure.
 
     Attributes:
-        low, high: None where it is not defined: outcomes never differ, or hardly any is a success.
-        p_value: two-sided, of the figure being 0: below 0.05 where 0 is outside the interval; at least 0.0002.
-        resampled: what was drawn anew.
+        low, high: bounds; `None` if the interval is not defined, because outcomes never differ or hardly any outcome is
+            a success.
+        p_value: two-sided p-value of the figure being 0. It is below 0.05 if 0 is outside the interval, and at least
+            0.0002. `None` if the interval is not defined.
+        resampled: description of the resampled units.
     """
 
     low: float | None
@@ -102,12 +118,13 @@ class Interval(NamedTuple):
 def interval(
     base_tasks: Sequence[Any], trials: Sequence[Any], outcomes: NDArray[np.generic], statistic: Statistic
 ) -> Interval:
-    """The interval of ``statistic``; the same whatever the order of the results.
+    """Compute the interval of ``statistic``; it does not depend on the order of the results.
 
     Args:
-        base_tasks: of each result; hashable names of one kind that can be sorted.
-        trials: of each result; results of one trial are drawn together.
+        base_tasks: base task of each result; hashable, sortable names of one type.
+        trials: trial of each result; results of one trial are resampled together.
         outcomes: (results, outcomes) numbers, which are summed.
+        statistic: the figure whose interval is computed.
     """
     bases = {name: place for place, name in enumerate(sorted(set(base_tasks)))}
     of_trial = dict(zip(trials, base_tasks, strict=True))
@@ -128,18 +145,18 @@ def interval(
 def _percentiles(
     sums: Floats, strata: NDArray[np.int64], statistic: Statistic
 ) -> tuple[float, float, float] | tuple[None, None, None]:
-    """Low, high and p.
+    """Compute the bounds and the p-value of an interval; three `None` if it is not defined.
 
     Args:
-        sums: (units, outcomes) of what is drawn.
-        strata: (units,) those within which they are drawn.
+        sums: (units, outcomes) sums of the outcomes of each resampled unit.
+        strata: (units,) stratum of each unit; units are resampled within their stratum.
     """
     groups = [sums[strata == stratum] for stratum in np.unique(strata)]
     freedom = len(sums) - len(groups)
     if freedom < 1:
         return None, None, None
     draws = seeding.rng("evaluation", "bootstrap")
-    # Rounded, so that what is 0 but for the order of a sum counts as 0.
+    # Rounded, so that figures that are 0 apart from floating-point errors count as 0.
     figures = np.round(statistic(np.sum([_drawn(group, draws) for group in groups], axis=0)), 12)
     if bool(np.isnan(figures).any()) or figures.min() == figures.max():
         return None, None, None
@@ -151,51 +168,63 @@ def _percentiles(
 
 
 def _drawn(group: Floats, draws: np.random.Generator) -> Floats:
-    """(RESAMPLES, outcomes) sums over as many units as there are, from one unit less."""
+    """Resample the units of a stratum.
+
+    Each resample has one unit less than the stratum, and its sums are scaled to the stratum's number of units.
+
+    Returns:
+        (RESAMPLES, outcomes) scaled sums.
+    """
     picked = draws.integers(len(group), size=(RESAMPLES, len(group) - 1), dtype=np.int32)
     sums = np.stack([outcome[picked].sum(axis=1) for outcome in np.ascontiguousarray(group.T)], axis=1)
     return np.asarray(sums * (len(group) / (len(group) - 1)), float)
 
 
 Pair = tuple[EpisodeResult, EpisodeResult]
-"""Two policies' results of one episode."""
+"""Results of two policies in one trial."""
 
 
 def paired(first: Iterable[EpisodeResult], second: Iterable[EpisodeResult]) -> list[Pair]:
-    """Results of the same task, initial state and draw."""
+    """Pair results with equal task, initial state and perturbation."""
     of_trial = {row.trial: row for row in second}
     return [(row, of_trial[row.trial]) for row in first if row.trial in of_trial]
 
 
 def compare(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Counts of the four outcomes, both rates, and whether they differ, as a whole and by axis.
+    """Compare two policies: counts of the four outcomes, both rates, and tests of their difference.
 
     Returns:
-        ``all`` and ``by_axis`` with ``p_value`` of McNemar's exact test, and ``difference``: the second rate minus the
-        first as ``value``, and its ``Interval``.
+        ``all`` and ``by_axis``. Each comparison has the ``p_value`` of McNemar's exact test, and the ``difference``:
+        the second rate minus the first as ``value``, and its ``Interval``.
     """
     by_axis = grouped((pair[0].axis, pair) for pair in pairs)
     return {"all": _compared(pairs), "by_axis": {axis: _compared(by_axis[axis]) for axis in sorted(by_axis)}}
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """The two-sided p-value of McNemar's exact test (McNemar, 1947).
+    """Compute the two-sided p-value of McNemar's exact test (McNemar, 1947).
 
-    Of the episodes that one policy alone solves, each is either's with probability 1/2 where both are as good.
+    If both policies are equally good, each episode that only one policy solves belongs to either policy with
+    probability 1/2.
     """
     trials = only_first + only_second
     return float(binomtest(only_first, trials).pvalue) if trials else 1.0
 
 
 def difference(sums: Floats) -> Floats:
-    """The second rate minus the first, of (n, 3) sums of successes of the first and of the second, and of episodes."""
+    """Compute the second rate minus the first, (n,).
+
+    Args:
+        sums: (n, 3) sums of the first policy's successes, the second policy's successes, and the episodes.
+    """
     return np.asarray((sums[:, 1] - sums[:, 0]) / sums[:, 2], float)
 
 
 def _compared(pairs: Sequence[Pair]) -> dict[str, Any]:
-    counts = Counter((one.success, other.success) for one, other in pairs)
+    """Compare two policies over some pairs of results, JSON-serialisable."""
+    counts = Counter((first.success, second.success) for first, second in pairs)
     both, only_first, only_second = counts[True, True], counts[True, False], counts[False, True]
-    outcomes = np.array([(one.success, other.success, 1) for one, other in pairs], float)
+    outcomes = np.array([(first.success, second.success, 1) for first, second in pairs], float)
     bases, trials = [(row.suite, row.base) for row, _ in pairs], [row.trial for row, _ in pairs]
     measured = interval(bases, trials, outcomes, difference)
     return {
@@ -212,42 +241,54 @@ def _compared(pairs: Sequence[Pair]) -> dict[str, Any]:
 
 
 def difficulty(solved: int, models: int) -> int:
-    """Level 1 to 5 of a task that ``solved`` of some models solve.
+    """Compute the difficulty, 1 to 5, of a task that ``solved`` of ``models`` models solve.
 
-    LIBERO-Plus has four models, and 5 minus how many solve the task. For any number of models this is 5 minus four
-    times the share that solves it, rounded to the nearest, halves to the harder: with up to seven models, 1 means that
-    all solve the task and 5 that none does.
+    LIBERO-Plus has four models; its difficulty is 5 minus the number of models that solve the task. For any number of
+    models, the difficulty is 5 minus four times the share of models that solve the task. It is rounded to the nearest
+    integer, and halves are rounded to the harder level. With up to seven models, 1 means that all models solve the
+    task, and 5 that no model does.
     """
     # ceil(4 solved / models - 1 / 2) in whole numbers.
     return 5 + (models - 8 * solved) // (2 * models)
 
 
 def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
-    """Every task that all models ran, as JSON, with its ``difficulty`` and how many models solve it.
+    """List every task that all models ran, as JSON, with its ``difficulty`` and the number of models that solve it.
 
-    Held-out perturbations have the component that was asked for, which names their episodes, also where another was
-    sampled.
+    A held-out perturbation has the requested component, which is part of its episode's name, even if a perturbation of
+    another component was used.
+
+    Args:
+        results: results of each model.
 
     Raises:
-        PipelineError: when results of a model have several settings, models cannot be compared, or no task was run by
-            all.
+        PipelineError: if results of a model have several settings, if models cannot be compared, or if no task was run
+            by all models.
     """
-    for of_model in results:
-        one_setting(of_model)
+    for model_results in results:
+        one_setting(model_results)
     refuse_different(chain(*results))
-    models = [{row.trial: row.success for row, _ in of_model if row.reason != REFUSED} for of_model in results]
-    shared = [trial for trial in models[0] if all(trial in model for model in models)]
-    if not shared:
-        raise PipelineError("no task was run by all models", remedy="evaluate all of them with the same --tasks-from")
-    graded = []
-    for trial in shared:
+    models: list[dict[Trial, bool]] = []
+    for model_results in results:
+        models.append({row.trial: row.success for row, _ in model_results if row.reason != REFUSED})
+    graded: list[dict[str, Any]] = []
+    for trial in models[0]:
+        if not all(trial in model for model in models):
+            continue
+        task, seed, _ = trial
         solved = sum(model[trial] for model in models)
-        graded.append({**asdict(_asked(*trial[:2])), "solved": solved, "difficulty": difficulty(solved, len(models))})
+        level = difficulty(solved, len(models))
+        graded.append({**asdict(_asked(task, seed)), "solved": solved, "difficulty": level})
+    if not graded:
+        raise PipelineError("no task was run by all models", remedy="evaluate all of them with the same --tasks-from")
     return graded
 
 
 def _asked(task: EvaluationTask, seed: int) -> EvaluationTask:
-    """A result's task as it was asked for: the scene may have refused that draw and taken one of another component."""
+    """Return the requested task of a result.
+
+    The requested component differs from the result's component if the scene rejected the first perturbation.
+    """
     if task.source != "own":
         return task
     return drawn_task(find_task(task.suite, task.base), task.axis, task.level, task.number, seed) or task

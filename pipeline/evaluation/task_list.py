@@ -1,4 +1,4 @@
-"""Lists of tasks in a file, for ``evaluate --tasks-from``."""
+"""Files with lists of tasks, for ``evaluate --tasks-from``."""
 
 import json
 from collections.abc import Iterable
@@ -16,11 +16,12 @@ from pipeline.seeding import digest
 
 
 class TaskList(BaseModel):
-    """What a file of tasks holds.
+    """Content of a file with a list of tasks.
 
     Attributes:
-        draws: of all held-out perturbations, by which another version tells whether it has the same.
-        tasks: may have more fields, such as ``difficulty``.
+        seed: seed of the tasks' perturbations.
+        draws: digest of all held-out perturbations; another version compares it to detect other perturbations.
+        tasks: the tasks; in the file, tasks may have more fields, such as ``difficulty``.
     """
 
     seed: int
@@ -28,16 +29,16 @@ class TaskList(BaseModel):
     tasks: list[EvaluationTask]
 
     def drawn(self) -> str:
-        """What ``draws`` is in this version; empty without held-out perturbations."""
-        drawn = [first_draws(task, self.seed) for task in self.tasks if task.source == "own"]
-        return digest(*drawn)[:16] if drawn else ""
+        """Compute ``draws`` with this version; empty without held-out perturbations."""
+        digests = [first_draws(task, self.seed) for task in self.tasks if task.source == "own"]
+        return digest(*digests)[:16] if digests else ""
 
 
 def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
-    """The tasks that ``analyse construct`` or ``analyse grade`` listed.
+    """Read the tasks that ``analyse construct`` or ``analyse grade`` listed.
 
     Raises:
-        PipelineError: when the file is not such a list, or has other draws: of another seed or version.
+        PipelineError: if the file is not such a list, or has perturbations of another seed or version.
     """
     try:
         listed = TaskList.model_validate_json(file.read_bytes())
@@ -54,17 +55,17 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
         raise PipelineError(
             "this version draws other perturbations for these tasks",
             where=file,
-            expected="a list that it made",
-            remedy="make the list anew with the command that made it, or evaluate with the version that made it",
+            expected="a list of this version",
+            remedy="generate the list again with the same command, or evaluate with the version that generated it",
         )
     return listed.tasks
 
 
 def refuse_other_list(file: Path) -> None:
-    """Reject a file that ``write_tasks`` would overwrite and that it has not written.
+    """Reject a file that ``write_tasks`` would overwrite but has not written.
 
     Raises:
-        PipelineError: naming the file.
+        PipelineError: if the file is rejected; it names the file.
     """
     refuse_other_file(file, '"draws": "')
 

@@ -1,8 +1,8 @@
-"""The tasks that policies are evaluated on: what names one, LIBERO's initial states, and other goals.
+"""Tasks of an evaluation: their identification, LIBERO's initial states, and replaced goals.
 
-LIBERO's tasks can be asked for another object of their scene, which the instruction and the BDDL goal name then. A
-policy that knows a scene by heart does what it always did there. The scene, the initial states and the predicates are
-LIBERO's own, so its environment judges the new goal.
+A replaced goal asks for another object of a LIBERO scene, which the instruction and the BDDL goal name. A policy that
+has memorised the scene repeats the original task. The scene, the initial states and the predicates are LIBERO's own, so
+LIBERO's environment judges the new goal.
 """
 
 from __future__ import annotations
@@ -31,23 +31,27 @@ from pipeline.types import Floats, Task
 Source = Literal["libero", "libero_plus", "own", "goals"]
 
 Prompt = Literal["clean", "benchmark", "blank"]
-"""What a policy is told: LIBERO's instruction; in test tasks what the benchmark's code takes for it, the name of the
-task's file ("turn on the stove view 0 0 100 2 352 initstate 0"); or nothing at all."""
+"""Kind of instruction for a policy.
+
+``clean`` is LIBERO's instruction. ``benchmark`` is, in test tasks, the instruction in the benchmark's code: the name of
+the task's file, such as "turn on the stove view 0 0 100 2 352 initstate 0". ``blank`` is an empty instruction.
+"""
 
 
 @dataclass(frozen=True, order=True)
 class EvaluationTask:
-    """One thing to do in one scene; all else is looked up by these.
+    """Identification of one task in one scene; everything else about the task is looked up by these fields.
 
     Attributes:
         source: ``libero``, ``libero_plus``, ``own`` for held-out perturbations on one or more of this project's axes,
             or ``goals`` for a LIBERO task that asks for another object of its scene.
-        suite, base: of the LIBERO task.
-        name: of the test task in LIBERO-Plus; else made of what follows, once among the tasks of its source and suite.
-        axis, component: what is perturbed, several joined by +; ``clean`` where nothing is. In ``goals`` the component
-            is the category of the object that is asked for.
-        level: strength, 1 to 5, of all that is drawn; 0 where nothing tells.
-        number: which draw (``own``), and which of LIBERO's initial states; 0 in ``libero_plus``.
+        suite, base: suite and name of the LIBERO task.
+        name: name of the test task in LIBERO-Plus, else a name that is composed of the other fields. It is unique among
+            the tasks of its source and suite.
+        axis, component: perturbed axis and component, several joined by +; ``clean`` without a perturbation. In
+            ``goals`` the component is the category of the object that is asked for.
+        level: strength of all perturbations, 1 to 5; 0 if it is unknown.
+        number: number of the perturbation (``own``), and of LIBERO's initial state; 0 in ``libero_plus``.
     """
 
     source: Source
@@ -63,17 +67,18 @@ class EvaluationTask:
         return f"{self.source}/{self.suite}/{self.name}"
 
     def for_harness(self) -> dict[str, Any]:
-        """As vla-eval takes a task, by a ``name`` that no other has; the task's own is ``task_name``."""
+        """Return the task in vla-eval's format, with a unique ``name``; the task's own name is ``task_name``."""
         return {**asdict(self), "name": str(self), "task_name": self.name}
 
     @classmethod
     def of_harness(cls, task: Mapping[str, Any]) -> EvaluationTask:
-        """The task that ``for_harness`` gave, or one of the harness's own LIBERO class, which numbers tasks.
+        """Return the task that ``for_harness`` returned, or a task of the harness's own LIBERO class.
 
-        The harness names tasks by instruction, which 16 tasks of LIBERO-90 share with one of another scene.
+        The harness's own class numbers tasks and names them by instruction. An instruction is not unique: 16 tasks of
+        LIBERO-90 share theirs with a task of another scene.
 
         Raises:
-            PipelineError: when LIBERO's suite has no task of this number and instruction.
+            PipelineError: if LIBERO's suite has no task with this number and instruction.
         """
         if "source" in task:
             return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
@@ -88,43 +93,47 @@ class EvaluationTask:
 
 
 def libero_task(task: Task, number: int) -> EvaluationTask:
-    """LIBERO's own task, from its initial state of that number."""
+    """Return LIBERO's own task, from its initial state with a number."""
     return EvaluationTask("libero", task.suite, task.name, f"{task.name}_state{number}", "clean", "clean", 0, number)
 
 
 @cache
 def libero_states(task: Task) -> Floats:
-    """(50, S) the initial states that LIBERO evaluates a task from: time, qpos, qvel."""
+    """Read the (50, S) initial states of LIBERO's evaluation of a task: time, qpos, qvel."""
     with np.load(libero_folder() / "init_files" / task.suite / f"{task.name}.pruned_init.npz") as arrays:
         return np.asarray(arrays["states"], np.float64)
 
 
 def balanced(wanted: Iterable[EvaluationTask], count: int, seed: int) -> list[EvaluationTask]:
-    """At most ``count`` tasks: axes in turn, of each axis its components in turn, then levels, then suites.
+    """Choose at most ``count`` tasks: axes in turn, for each axis its components in turn, then levels, then suites.
 
-    A larger subset under the same seed holds the smaller one.
+    With equal seeds, a larger subset contains a smaller one.
     """
     return sorted(_in_turn(list(wanted), ("axis", "component", "level", "suite"), seed)[:count])
 
 
 def _in_turn(wanted: list[EvaluationTask], columns: tuple[str, ...], seed: int) -> list[EvaluationTask]:
-    """All tasks, one of each value of the first column after the other, of each value by the columns that follow."""
+    """Order tasks so that the values of the first column take turns, and for each value those of the next columns."""
     if not columns:
         return sorted(wanted, key=lambda task: seeding.digest("subset", seed, str(task)))
     column, *rest = columns
     groups = grouped((getattr(task, column), task) for task in wanted)
     names = sorted(groups, key=lambda name: seeding.digest("turn", seed, column, name, str(min(groups[name]))))
     rows = [_in_turn(groups[name], tuple(rest), seed) for name in names]
-    return [task for turn in zip_longest(*rows) for task in turn if task is not None]
+    ordered: list[EvaluationTask] = []
+    for turn in zip_longest(*rows):
+        ordered += [task for task in turn if task is not None]
+    return ordered
 
 
 @dataclass(frozen=True)
 class Replacement:
-    """Another object in the place of the one that a task's goal puts somewhere.
+    """Replacement of the object that a task's goal puts somewhere.
 
     Attributes:
-        old, new: names in the BDDL file.
-        instruction: LIBERO's, with the new object's words.
+        old, new: names of the two objects in the BDDL file.
+        category: category of the new object.
+        instruction: LIBERO's instruction with the new object's words.
     """
 
     old: str
@@ -133,69 +142,90 @@ class Replacement:
     instruction: str
 
     def name(self, task: Task, number: int) -> str:
-        """Of the evaluation task that begins in LIBERO's initial state of that number."""
+        """Return the name of the evaluation task that begins in LIBERO's initial state with a number."""
         return f"{task.name}_goal_{self.old}_{self.new}_state{number}"
 
     def bddl_text(self, task: Task) -> str:
-        """The task's file with the new object in its goal; objects and regions stay, and so do initial states."""
+        """Return the task's BDDL text with the new object in its goal.
+
+        Objects, regions and initial states do not change.
+        """
         text = task.bddl_file.read_text()
         start = text.index("(:goal")
         return text[:start] + re.sub(rf"\b{self.old}\b", self.new, text[start:])
 
 
 WHICH = r".*?(?= and (?:place|put)\b)| (?:at|on|in) the (?:back|front|left|middle|right)(?! of)\b"
-"""What says which of several things of a category is meant, after the words for it."""
+"""Pattern of the phrase after the words for a thing that selects one of several things of its category."""
 
 
 @cache
 def replacements(task: Task) -> tuple[Replacement, ...]:
-    """All that can take the place of an object that the task's goal puts somewhere.
+    """List the replacements of the objects that a task's goal puts somewhere.
 
-    The new object can be moved, carries nothing, is not in the goal yet and is not what names the place, as the plate
-    does for a region beside it. It is the only one of its category, and its words mean it alone. It fits where the old
-    one goes: one of LIBERO's 130 tasks puts an object of its category on or in a thing of the same kind, or it is no
-    larger than an object that one of them puts there.
+    A new object can be moved and carries nothing. It is not in the goal yet, and the place is not named after it (a
+    region beside a plate is named after the plate). It is the only object of its category, and its words mean it alone.
+
+    The new object fits in the old object's place if one of LIBERO's 130 tasks puts its category on or in a thing of
+    this kind. It also fits if it is no larger than an object that one of these tasks puts there.
     """
-    known = bddl.read(task.bddl_file)
-    named = {word for fact in known.goal for word in fact}
-    carrying = {place for thing, place in known.places.items() if thing in known.objects}
-    kinds = list(known.objects.values())
-    possible = []
-    for old in known.targets:
-        if [known.objects[target] for target in known.targets].count(known.objects[old]) > 1:
+    scene = bddl.read(task.bddl_file)
+    named: set[str] = set()
+    for fact in scene.goal:
+        named |= set(fact)
+    carrying = {place for thing, place in scene.places.items() if thing in scene.objects}
+    categories = list(scene.objects.values())
+    target_categories = [scene.objects[target] for target in scene.targets]
+    possible: list[Replacement] = []
+    for old in scene.targets:
+        if target_categories.count(scene.objects[old]) > 1:
             continue  # "both moka pots" has no words for one of them
-        relation, place = next((fact[0], fact[2]) for fact in known.goal if fact[1] == old)
-        beside = known.beside(place)
-        taken = {*known.receptacles, *carrying, *named, *(beside.things if beside else ())}
-        for new, category in known.objects.items():
-            if new in taken or kinds.count(category) > 1 or not _fits(category, relation, place, known):
+        relation, place = next((fact[0], fact[2]) for fact in scene.goal if fact[1] == old)
+        beside = scene.beside(place)
+        taken = {*scene.receptacles, *carrying, *named, *(beside.things if beside else ())}
+        for new, category in scene.objects.items():
+            if new in taken or categories.count(category) > 1 or not _fits(category, relation, place, scene):
                 continue
-            if (instruction := _reworded(task, old, category)) is not None:
+            instruction = _reworded(task, old, category)
+            if instruction is not None:
                 possible.append(Replacement(old, new, category, instruction))
     return tuple(possible)
 
 
 def find_replacement(task: Task, name: str) -> Replacement:
-    """The replacement that the name of an evaluation task says; refused when the task has none of that name."""
-    named = {one.name(task, 0).rpartition("_")[0]: one for one in replacements(task)}
+    """Return the replacement in the name of an evaluation task.
+
+    Raises:
+        PipelineError: if the task has no such replacement.
+    """
+    named: dict[str, Replacement] = {}
+    for replacement in replacements(task):
+        goal = replacement.name(task, 0).rpartition("_")[0]
+        named[goal] = replacement
     asked = name.rpartition("_")[0]
     if asked not in named:
-        others = " or ".join(named) or "a task with other objects"
-        raise PipelineError(f"{task.suite} has no goal {asked!r}", expected=others)
+        goals = " or ".join(named) or "a task with other objects"
+        raise PipelineError(f"{task.suite} has no goal {asked!r}", expected=goals)
     return named[asked]
 
 
-def _fits(category: str, relation: str, place: str, known: Bddl) -> bool:
-    """Whether an object of a category can be where a goal puts another one; anywhere on the working surface it can."""
-    if place in known.regions:
+def _fits(category: str, relation: str, place: str, scene: Bddl) -> bool:
+    """Return whether an object of a category fits in a goal's place; every object fits on the working surface."""
+    if place in scene.regions:
         return True
-    there, sides = _put()[relation, _kind(place, known)], 3 if relation == "in" else 2
-    return category in there or any((_size_m(category) <= _size_m(other))[:sides].all() for other in there)
+    fitting = _put()[relation, _kind(place, scene)]
+    if category in fitting:
+        return True
+    sides = 3 if relation == "in" else 2
+    return any((_size_m(category) <= _size_m(larger))[:sides].all() for larger in fitting)
 
 
 @cache
 def _size_m(category: str) -> Floats:
-    """(3,) shorter and longer side of an object's footprint, and its height; NaN where its model is not known."""
+    """Return the (3,) size of an object: shorter and longer side of its footprint, and its height.
+
+    The size is NaN if the object's model is not known.
+    """
     model = next((model for model in offered("libero") if model.name == f"libero/{category}"), None)
     size_m = np.full(3, np.nan) if model is None else np.subtract(model.shape.high_m, model.shape.low_m)
     return np.array([*sorted(size_m[:2]), size_m[2]])
@@ -203,59 +233,68 @@ def _size_m(category: str) -> Floats:
 
 @cache
 def _put() -> Mapping[tuple[str, str], set[str]]:
-    """Relation and kind of place to the categories that LIBERO's tasks put there."""
-    there: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for known in (bddl.read(task.bddl_file) for suite in SUITES for task in tasks(suite)):
-        for fact in known.goal:
-            if len(fact) == 3 and fact[1] in known.objects:
-                there[fact[0], _kind(fact[2], known)].add(known.objects[fact[1]])
-    return there
+    """Return relation and kind of a place to the categories of the objects that LIBERO's tasks put there."""
+    categories: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for suite in SUITES:
+        for task in tasks(suite):
+            scene = bddl.read(task.bddl_file)
+            for fact in scene.goal:
+                if len(fact) == 3 and fact[1] in scene.objects:
+                    categories[fact[0], _kind(fact[2], scene)].add(scene.objects[fact[1]])
+    return categories
 
 
-def _kind(place: str, known: Bddl) -> str:
-    """A place by its thing's category: ``basket_contain_region`` for ``basket_1_contain_region``."""
-    thing = known.owner(place) or ""
-    return known.category(thing) + place.removeprefix(thing)
+def _kind(place: str, scene: Bddl) -> str:
+    """Name a place by its thing's category: ``basket_contain_region`` for ``basket_1_contain_region``."""
+    thing = scene.owner(place) or ""
+    return scene.category(thing) + place.removeprefix(thing)
 
 
 def _reworded(task: Task, old: str, category: str) -> str | None:
-    """The instruction with the words for another category in the place of those for ``old``, and of the phrase that
-    says which of several it is: ``between the plate and the ramekin``, ``at the back``.
+    """Return the instruction with the words for another category in place of the words for ``old``.
 
-    `None` if that would be no plain sentence about one thing: the words for ``old`` stand in it twice or not at all, or
-    the new words also mean another thing of the scene.
+    The new words also replace the phrase that selects one of several objects: ``between the plate and the ramekin``,
+    ``at the back``.
+
+    Return `None` if the result would not be a plain sentence about one thing: the words for ``old`` are in it twice or
+    not at all, or the new words also mean another thing of the scene.
     """
-    known = bddl.read(task.bddl_file)
-    old_category, new_words = known.objects[old], _words(task.suite, category)
-    scene = thing_words(tuple(dict.fromkeys(map(known.category, known.things))), hints=False)
-    mentions = [match for match, kinds in found(task.instruction, scene) if old_category in kinds]
-    if len(mentions) != 1 or _means_another(new_words, category, known):
+    scene = bddl.read(task.bddl_file)
+    old_category, new_words = scene.objects[old], _words(task.suite, category)
+    scene_words = thing_words(tuple(dict.fromkeys(map(scene.category, scene.things))), hints=False)
+    mentions = [match for match, kinds in found(task.instruction, scene_words) if old_category in kinds]
+    if len(mentions) != 1 or _means_another(new_words, category, scene):
         return None
     before, after = task.instruction[: mentions[0].start()], task.instruction[mentions[0].end() :]
-    if list(known.objects.values()).count(old_category) > 1:
+    if list(scene.objects.values()).count(old_category) > 1:
         after = re.sub(f"^(?:{WHICH})", "", after)
     return f"{before}{new_words}{after}"
 
 
-def _means_another(text: str, category: str, known: Bddl) -> bool:
-    """Whether a thing of another category in the scene is called so too."""
-    others = {known.category(thing) for thing in known.things} - {category}
-    meant = thing_words(tuple(others), hints=False)
-    return pattern(tuple(meant)).fullmatch(text) is not None
+def _means_another(text: str, category: str, scene: Bddl) -> bool:
+    """Return whether a text also means a thing of another category in the scene."""
+    other_categories = {scene.category(thing) for thing in scene.things} - {category}
+    other_words = thing_words(tuple(other_categories), hints=False)
+    return pattern(tuple(other_words)).fullmatch(text) is not None
 
 
 @cache
 def _words(suite: str, category: str) -> str:
-    """What LIBERO's instructions call the only thing of a category, in this suite if they do.
+    """Find the words of LIBERO's instructions for the only thing of a category, in this suite if possible.
 
     Raises:
-        PipelineError: when no instruction in a scene that has one of it calls it by any of its names.
+        PipelineError: if no instruction in a scene with one thing of the category has any of its names.
     """
-    for among in ((suite,), SUITES):
-        scenes = [(task, bddl.read(task.bddl_file)) for one in among for task in tasks(one)]
-        told = [task.instruction for task, known in scenes if list(known.objects.values()).count(category) == 1]
-        for name in words().things[category].names:
-            for instruction in told:
-                if match := pattern((name,)).search(instruction):
+    for suites in ((suite,), SUITES):
+        instructions: list[str] = []
+        for name in suites:
+            for task in tasks(name):
+                categories = list(bddl.read(task.bddl_file).objects.values())
+                if categories.count(category) == 1:
+                    instructions.append(task.instruction)
+        for thing_name in words().things[category].names:
+            for instruction in instructions:
+                match = pattern((thing_name,)).search(instruction)
+                if match:
                     return match[0]
     raise PipelineError(f"LIBERO's instructions have no words for {category}", where="language_words.yaml")

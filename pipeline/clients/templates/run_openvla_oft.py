@@ -1,35 +1,39 @@
-"""Fine-tune OpenVLA-OFT on the datasets beside this folder, by the settings in ``finetune.yaml``.
+"""Fine-tuning of OpenVLA-OFT on the datasets next to this folder, with the settings in ``finetune.yaml``.
 
-Call it in a checkout of OpenVLA-OFT, which stays as it is:
+Call this script in a checkout of OpenVLA-OFT. It does not change the checkout:
 
     WANDB_MODE=offline torchrun --standalone --nnodes 1 --nproc-per-node 8 DATA/finetune/run_openvla_oft.py
 
-OFT always logs to Weights & Biases; offline it needs no account. With one, give ``--wandb_entity NAME --wandb_project
-NAME`` instead. Further arguments go to OFT's ``vla-scripts/finetune.py`` and win over these, such as
-``--dataset_name libero_perturbed_spatial`` for one suite, or ``--max_steps 20000``.
+OFT always logs to Weights & Biases; offline logging needs no account. With an account, give ``--wandb_entity NAME
+--wandb_project NAME`` instead. Further arguments are passed to OFT's ``vla-scripts/finetune.py`` and override the
+settings. Examples are ``--dataset_name libero_perturbed_spatial`` for one suite, and ``--max_steps 20000``.
 
-To continue for N steps from a checkpoint that was trained on LIBERO, saved at STEP in the folder CHECKPOINT, add
+A checkpoint that was trained on LIBERO and saved at STEP in the folder CHECKPOINT can be trained for N more steps. Add
 
     --vla_path CHECKPOINT --statistics CHECKPOINT/dataset_statistics.json --resume True --resume_step STEP
     --max_steps STEP+N
 
-Its action head, which OFT loads only with ``--resume``, gives actions in units of its own statistics; with others, the
-same outputs would be other movements. Warm-up and cosine go from STEP to the last step. Without ``--statistics``, the
-statistics are those of these datasets, and a resumed run goes on within its own cosine.
+OFT loads the checkpoint's action head only with ``--resume``. The head gives actions in units of the checkpoint's own
+statistics; with different statistics, equal outputs would be different movements. Warm-up and cosine run from STEP to
+the last step. Without ``--statistics``, these datasets' statistics are used, and a resumed run continues its cosine.
 
-To train on LIBERO's sets too, link both into one folder, and name each set with its weight, which OFT multiplies by the
-set's steps, as it does the 1 of these:
+To train on LIBERO's datasets too, link both into one folder, and name each of LIBERO's datasets with its weight. OFT
+multiplies each weight by the dataset's number of steps. The datasets of this run have the weight 1:
 
     --data_root_dir MIX --mix libero_goal_no_noops=1 --mix libero_10_no_noops=0.5
 
-OFT's evaluation has one entry of statistics a suite, ``libero_goal``, and takes ``libero_goal_no_noops`` only without
-it. So all sets of a suite get the same: those of ``--statistics``, else of the first, which is of these datasets where
-they have the suite. LIBERO's sets have no split ``val``: leave out ``--use_val_set True``.
+OFT's evaluation reads one entry of statistics per suite, ``libero_goal``. It reads ``libero_goal_no_noops`` only if
+``libero_goal`` is missing. Therefore all datasets of a suite get equal statistics: the statistics of ``--statistics``,
+else those of the suite's first dataset. The first is a dataset of this run if the run has the suite. LIBERO's datasets
+have no split ``val``: leave out ``--use_val_set True``.
 
-What OFT has no flag for is done here: the datasets and their mixture are registered, AdamW gets the settings' weight
-decay (OFT leaves PyTorch's 0.01), a cosine with warm-up takes the place of OFT's step (whose own warm-up would undo
-any later decay), the statistics of a checkpoint are also named by suite, which is where OFT's evaluation looks, and
-the statistics that OFT computes first are not written among the dataset's files.
+OFT has no flags for the following settings, so this script applies them:
+
+* The datasets and their mixture are registered.
+* AdamW gets the settings' weight decay (OFT leaves PyTorch's 0.01).
+* A cosine with warm-up replaces OFT's step, because OFT's own warm-up would undo any later decay.
+* The statistics of a checkpoint are stored under suite names too, because OFT's evaluation looks them up by suite.
+* The statistics that OFT computes first are not written into the dataset's folder.
 """
 
 import argparse
@@ -50,7 +54,7 @@ DATASETS = "prismatic.vla.datasets.rlds"
 
 
 def mixed(text: str) -> tuple[str, float]:
-    """One of LIBERO's sets and its weight, of a text such as ``libero_goal_no_noops=0.5``."""
+    """Parse the name of a LIBERO dataset and its weight from a text such as ``libero_goal_no_noops=0.5``."""
     match = re.fullmatch(r"(libero_\w+_no_noops)=(\d+\.?\d*|\.\d+)", text)
     if match is None or not float(match[2]):
         raise argparse.ArgumentTypeError(f"{text!r}, expected a set of LIBERO and a weight: libero_goal_no_noops=1")
@@ -58,11 +62,12 @@ def mixed(text: str) -> tuple[str, float]:
 
 
 def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, float]) -> None:
-    """Enter every dataset, and every mixture of them, where OFT looks datasets up by name.
+    """Register every dataset and every mixture in the tables from which OFT reads datasets by name.
 
     Args:
         mixtures: name of a mixture to its datasets, each with its weight.
-        added: LIBERO's sets, which come after the others in each mixture and beside each dataset.
+        added: LIBERO's datasets, each with its weight. They are added to the end of each mixture and of each single
+            dataset.
     """
     configs = importlib.import_module(f"{DATASETS}.oxe.configs")
     transforms = importlib.import_module(f"{DATASETS}.oxe.transforms")
@@ -76,7 +81,7 @@ def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, fl
             configs.OXE_DATASET_CONFIGS[dataset] = {
                 "image_obs_keys": {"primary": "image", "secondary": None, "wrist": "wrist_image"},
                 "depth_obs_keys": {"primary": None, "secondary": None, "wrist": None},
-                # Made by the transform: position and axis-angle (which OFT calls Euler), and two fingers.
+                # The transform makes these keys: position and axis-angle (which OFT calls Euler), and two fingers.
                 "state_obs_keys": ["EEF_state", "gripper_state"],
                 "state_encoding": configs.StateEncoding.POS_EULER,
                 "action_encoding": configs.ActionEncoding.EEF_POS,
@@ -84,7 +89,7 @@ def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, fl
 
 
 def name_statistics_by_suite(suites: Mapping[str, str]) -> None:
-    """Store each dataset's statistics under its suite's name too: OFT's evaluation knows no other."""
+    """Store each dataset's statistics under its suite's name too: OFT's evaluation reads no other name."""
     module: Any = importlib.import_module(f"{DATASETS}.utils.data_utils")
     save = module.save_dataset_statistics
 
@@ -96,7 +101,11 @@ def name_statistics_by_suite(suites: Mapping[str, str]) -> None:
 
 
 def statistics_of(file: Path, suites: Collection[str]) -> dict[str, dict[str, Any]]:
-    """Suites to a checkpoint's statistics of actions and proprioception, as far as it has them."""
+    """Return suite to a checkpoint's statistics of actions and proprioception, for the suites in the file.
+
+    Raises:
+        SystemExit: if the file has statistics for none of the suites.
+    """
     stored = json.loads(file.read_text())
     former = {}
     for suite in suites:
@@ -110,43 +119,43 @@ def statistics_of(file: Path, suites: Collection[str]) -> dict[str, dict[str, An
 
 
 def set_statistics(dataset_sha256: str, suite_of: Mapping[str, str], former: Mapping[str, Mapping[str, Any]]) -> None:
-    """Have all datasets of a suite normalised alike, and OFT's loader write what it computes to its cache folder.
+    """Make OFT normalise all datasets of a suite alike and write the statistics it computes to its cache folder.
 
-    ``dataset_statistics_<hash>.json`` would change the dataset's files. OFT takes it for another run's where sizes and
-    counts are the same, so the manifest's hash goes into its name.
+    In the dataset's folder, ``dataset_statistics_<hash>.json`` would change the dataset's files. OFT confuses the
+    files of two runs with equal sizes and counts, so the manifest's hash becomes part of the file's name.
 
     Args:
         suite_of: dataset to suite.
-        former: suite to the statistics that take the place of a dataset's own; its counts, by which OFT weighs it,
-            stay. Without any, the first dataset of a suite gives those of the others.
+        former: suite to the statistics that replace a dataset's own. The dataset keeps its own counts, which OFT uses
+            as weights. If empty, the statistics of a suite's first dataset replace those of the suite's other datasets.
     """
-    # The module that calls the function; it has imported it by name.
+    # This module calls the function; it has imported the function by name.
     module: Any = importlib.import_module(f"{DATASETS}.dataset")
     compute = module.get_dataset_statistics
-    folder = Path.home() / ".cache" / "orca"  # where OFT itself writes when it may not write to the dataset
+    folder = Path.home() / ".cache" / "orca"  # OFT's own choice if the dataset's folder is read-only
     folder.mkdir(parents=True, exist_ok=True)
     shared = dict(former)
 
     def get_dataset_statistics(dataset: Any, hash_dependencies: tuple[str, ...], save_dir: object = None) -> Any:
-        own = compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
+        computed = compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
         # OFT passes the folder of the dataset's version.
         name = Path(str(save_dir)).parent.name
         suite = suite_of.get(name, name)
         if former and suite not in former:
             sys.exit(f"error: the given statistics have none for {suite}\n  they have: {', '.join(former)}")
-        counts = {part: number for part, number in own.items() if part.startswith("num_")}
-        return {**shared.setdefault(suite, own), **counts}
+        counts = {part: number for part, number in computed.items() if part.startswith("num_")}
+        return {**shared.setdefault(suite, computed), **counts}
 
     module.get_dataset_statistics = get_dataset_statistics
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """The learning rate: a linear warm-up, then a cosine that ends at 0 with the last step.
+    """Schedule of the learning rate: a linear warm-up, then a cosine that ends at 0 with the last step.
 
     Attributes:
-        steps: from the first run on where training is resumed.
-        warmup_steps: how many of them rise to the full rate.
+        steps: number of steps, counted from the first run if training is resumed.
+        warmup_steps: number of steps in which the rate rises to the full rate.
         first: the step that this run begins with.
     """
 
@@ -155,7 +164,7 @@ class Schedule:
     first: int = 0
 
     def share(self, step: int) -> float:
-        """The share of the full rate at a step of this run, the first of which is 0."""
+        """Return the share of the full rate at a step of this run; this run's first step is 0."""
         step += self.first
         if step < self.warmup_steps:
             return (step + 1) / self.warmup_steps
@@ -164,21 +173,22 @@ class Schedule:
 
 
 def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, anew: bool = False) -> Schedule:
-    """The recipe's schedule, by the steps, the warm-up and the resumed step among OFT's arguments.
+    """Return the recipe's schedule with the steps, the warm-up and the resumed step from OFT's arguments.
 
     Args:
         words: arguments of OFT's script.
-        steps: the recipe's, for want of ``--max_steps``.
-        warmup_steps: the recipe's; without ``--lr_warmup_steps`` the same share of the schedule's steps.
-        anew: whether the resumed checkpoint is of another training, so that the schedule begins with it.
+        steps: the recipe's number of steps, used without ``--max_steps``.
+        warmup_steps: the recipe's number of warm-up steps. Without ``--lr_warmup_steps``, the schedule has the
+            recipe's ratio of warm-up steps to steps.
+        anew: True if the resumed checkpoint comes from another training, so that the schedule begins with it.
 
     Raises:
-        SystemExit: with words, when nothing is resumed although ``anew``, or OFT would never stop.
+        SystemExit: with a message, if ``anew`` is set but nothing is resumed, or if OFT would never stop.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--max_steps", type=int, default=steps)
     parser.add_argument("--lr_warmup_steps", type=int)
-    yaml: Any = importlib.import_module("yaml")  # as OFT reads its booleans
+    yaml: Any = importlib.import_module("yaml")  # OFT parses its booleans with YAML
     parser.add_argument("--resume", type=yaml.safe_load, default=False)
     parser.add_argument("--resume_step", type=int, default=0)
     given, _ = parser.parse_known_args(words)
@@ -199,8 +209,8 @@ def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, anew: 
 
 
 def set_optimiser(weight_decay: float, schedule: Schedule) -> None:
-    """Have OFT's script find the recipe's optimiser and schedule where it looks for ``AdamW`` and ``MultiStepLR``."""
-    import torch  # takes seconds, which a call in the wrong folder need not wait for
+    """Replace ``AdamW`` and ``MultiStepLR``, which OFT's script imports, by the recipe's optimiser and schedule."""
+    import torch  # takes seconds; a call in the wrong folder fails before this import
 
     class AdamW(torch.optim.AdamW):
         def __init__(self, params: Any, lr: float) -> None:
@@ -215,7 +225,7 @@ def set_optimiser(weight_decay: float, schedule: Schedule) -> None:
 
 
 def arguments(recipe: Mapping[str, Any]) -> list[str]:
-    """The recipe as arguments of OFT's script."""
+    """Return the recipe as arguments of OFT's script."""
     training = {name: field["value"] for name, field in recipe["training"].items()}
     flags = {
         "vla_path": training["base_weights"],
@@ -234,35 +244,39 @@ def arguments(recipe: Mapping[str, Any]) -> list[str]:
         "lora_rank": training["lora_rank"],
         "shuffle_buffer_size": training["shuffle_buffer"],
     }
-    return [word for name, value in flags.items() for word in (f"--{name}", str(value))]
+    words: list[str] = []
+    for name, value in flags.items():
+        words += [f"--{name}", str(value)]
+    return words
 
 
 def prepare() -> None:
-    """Give OFT the recipe: its arguments, and all that it has no flag for."""
+    """Give OFT the recipe: arguments, and the settings for which OFT has no flag."""
     yaml: Any = importlib.import_module("yaml")
     recipe = yaml.safe_load((HERE / "finetune.yaml").read_text())
     dataset, training = recipe["dataset"], recipe["training"]
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--statistics", type=Path)
     parser.add_argument("--mix", type=mixed, action="append", default=[])
-    own, given = parser.parse_known_args()
-    added, suites = dict(own.mix), dataset["suites"]["value"]
+    options, given = parser.parse_known_args()
+    added, suites = dict(options.mix), dataset["suites"]["value"]
     suite_of = {name: suite for suite, name in suites.items()}
     suite_of |= {name: name.removesuffix("_no_noops") for name in added}
     schedule = read_schedule(
-        given, training["steps"]["value"], training["warmup_steps"]["value"], anew=own.statistics is not None
+        given, training["steps"]["value"], training["warmup_steps"]["value"], anew=options.statistics is not None
     )
-    # OFT takes its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" among the arguments.
-    # Of two values the last counts; a warm-up of OFT's own would undo the cosine, so there is none.
+    # OFT derives its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" in the arguments.
+    # If a flag is given twice, its last value counts. OFT's own warm-up would undo the cosine, so it is set to 0.
     sys.argv = [SCRIPT, *arguments(recipe), *given, "--lr_warmup_steps", "0"]
     register(dataset["mixtures"]["value"], added)
     name_statistics_by_suite(suites)
-    former = statistics_of(own.statistics, dict.fromkeys(suite_of.values())) if own.statistics else {}
+    former = statistics_of(options.statistics, dict.fromkeys(suite_of.values())) if options.statistics else {}
     set_statistics(dataset["sha256"]["value"], suite_of, former)
     set_optimiser(training["weight_decay"]["value"], schedule)
 
 
 def main() -> None:
+    """Run OFT's script with the recipe, or end with a message if OFT cannot be imported."""
     if not Path(SCRIPT).is_file():
         sys.exit(f"error: no {SCRIPT} in {Path.cwd()}\n  try: call this in a checkout of OpenVLA-OFT")
     try:
