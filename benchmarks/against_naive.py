@@ -1,12 +1,12 @@
-"""Replay and rendering of a configuration's episodes, ours beside one LIBERO environment for each of them.
+"""Replay and rendering of a configuration's episodes: our stages, and one LIBERO environment for each episode.
 
     nice -n 10 python benchmarks/against_naive.py [--config configs/starter.yaml] [--tasks 'libero_goal/put_the_bowl_*']
 
-Takes a demonstration of the starter set for each task, and as many episodes as the configuration asks for each
-demonstration. Ours replays and renders as the stages do, failed replays included. The naive way opens LIBERO's own
-environment for every kept episode, makes the same changes to its model, steps the same actions with both cameras, and
-encodes the frames. Each in this process and on one core. The last line is JSON: CPU seconds of both, and how many
-of the frames are the same bytes.
+The script takes one demonstration of the starter set for each task, and the configuration's number of episodes for each
+demonstration. Our side replays and renders as the stages do, failed replays included. The naive side opens LIBERO's
+own environment for every kept episode and changes its model in the same way. It steps the same actions with both
+cameras and encodes the frames. Both sides run in this process and on one core. The last line is JSON: CPU seconds of
+both sides, and the number of frames with equal bytes.
 """
 
 import argparse
@@ -22,7 +22,7 @@ os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THRE
 
 from pipeline import gl
 
-# Both render with what is chosen before robosuite is imported.
+# Both sides render with the device that is chosen before robosuite is imported.
 gl.choose()
 
 import mujoco  # noqa: E402
@@ -71,15 +71,13 @@ def main() -> None:
             theirs = naive(row, trajectory, config)
             took_s = time.process_time() - start
             naive_s += took_s
-            shown = streams_of(row.perturbations)
-            ours = store.load(row.trajectory_id, [stream.stream_id for stream in shown.values()], set()).streams
-            pairs = [
-                (mine, other)
-                for view, stream in shown.items()
-                for mine, other in zip(ours[stream.stream_id], theirs[view], strict=True)
-            ]
-            same += sum(mine == other for mine, other in pairs)
-            count += len(pairs)
+            streams = streams_of(row.perturbations)
+            stream_ids = [stream.stream_id for stream in streams.values()]
+            ours = store.load(row.trajectory_id, stream_ids, set()).streams
+            for view, stream in streams.items():
+                for our_frame, naive_frame in zip(ours[stream.stream_id], theirs[view], strict=True):
+                    same += our_frame == naive_frame
+                    count += 1
             print(f"{row.episode_id} {row.axis}: naive {took_s:.0f} s", flush=True)
     print(
         json.dumps(
@@ -99,7 +97,7 @@ def main() -> None:
 
 
 def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, list[bytes]]:
-    """View to the encoded frames before each action, from an environment of the episode's own."""
+    """Render an episode in an environment of its own; return view to the encoded frames before each action."""
     height, width, _ = SCHEMA.frame.shape
     task = find_task(row.suite, row.task)
     env = OffScreenRenderEnv(bddl_file_name=str(task.bddl_file), camera_heights=height, camera_widths=width)
@@ -114,10 +112,10 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
     if not (textures == model.tex_data).all():
         for texture in range(model.ntex):
             mujoco.mjr_uploadTexture(model, context.con, texture)
-    # Left to themselves, LIBERO's observations are rendered a substep before the state that a step ends in.
+    # LIBERO itself renders its observations a substep before the final state of a step.
     for spec in SCHEMA.views.values():
         env.env.modify_observable(f"{spec.camera}_image", "enabled", False)
-    # What a replay restores beside the state, see pipeline/physics/environment.py.
+    # A replay restores more than the state, see pipeline/physics/environment.py.
     robot, scene = env.env.robots[0], trajectory.scene
     robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
     env.sim.reset()
@@ -133,7 +131,7 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
         env.step(DUMMY_ACTION)
     frames: dict[str, list[bytes]] = {view: [] for view in SCHEMA.views}
     for step, action in enumerate(trajectory.actions):
-        # A step ends with positions that are integrated, and bodies and cameras that are a substep behind them.
+        # A step ends with integrated positions; bodies and cameras are a substep behind.
         mujoco.mj_kinematics(model, env.sim.data._data)
         mujoco.mj_camlight(model, env.sim.data._data)
         for view, spec in SCHEMA.views.items():

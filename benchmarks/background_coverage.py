@@ -1,10 +1,10 @@
-"""How much of each view new backgrounds cover, in one scene of each of LIBERO's arenas.
+"""Share of each view that new backgrounds cover, in one scene of each of LIBERO's arenas.
 
     python benchmarks/background_coverage.py
 
-The textures that a component replaces are made black, then white: the pixels that differ are those that show them.
-Prints JSON: for each arena and component the share of both views in per cent. `wall, floor` is a theme without its
-working surface.
+The textures of a component are painted black, then white: the pixels that differ show these textures. The output is
+JSON: for each arena and component the share of both views in per cent. `wall, floor` is a theme without its working
+surface.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ COMPONENTS: dict[str, tuple[Part, ...]] = {
     "surface": PARTS["surface"],
 }
 NOTICED = 8
-"""Grey levels in any channel; other things may mirror a surface faintly."""
+"""Smallest difference that counts, in grey levels of any channel; some objects mirror a surface faintly."""
 
 
 class Painted(RenderPerturbation):
@@ -56,7 +56,10 @@ class Painted(RenderPerturbation):
     grey: int
 
     def apply(self, model: mujoco.MjModel) -> None:
-        for skin in (skin for part in self.parts if (skin := skin_of(model, part))):
+        for part in self.parts:
+            skin = skin_of(model, part)
+            if not skin:
+                continue
             start, pixels = model.tex_adr[skin.texture], model.tex_height[skin.texture] * model.tex_width[skin.texture]
             model.tex_data[start : start + pixels * model.tex_nchannel[skin.texture]] = self.grey
 
@@ -66,26 +69,26 @@ def main() -> None:
     for arena, (suite, name) in TASKS.items():
         task = find_task(suite, name)
         environment = Environment(task)
-        shown = Renderer(environment.place_fixtures(4))
+        renderer = Renderer(environment.place_fixtures(4))
         environment.close()
         state = StarterSource().of(task).init_state
-        figures[arena] = {component: shares(shown, state, parts) for component, parts in COMPONENTS.items()}
-        shown.close()
+        figures[arena] = {component: shares(renderer, state, parts) for component, parts in COMPONENTS.items()}
+        renderer.close()
     print(json.dumps(figures, indent=1))
 
 
-def shares(shown: Renderer, state: Floats, parts: tuple[Part, ...]) -> dict[str, float]:
-    """Per cent of each view that shows the parts."""
-    black, white = (frames(shown, state, parts, grey) for grey in (0, 255))
+def shares(renderer: Renderer, state: Floats, parts: tuple[Part, ...]) -> dict[str, float]:
+    """Return the share of each view that shows the parts, in per cent."""
+    black, white = frames(renderer, state, parts, 0), frames(renderer, state, parts, 255)
     differ = {view: np.abs(black[view].astype(int) - white[view]).max(axis=2) > NOTICED for view in black}
     return {view: round(100 * float(pixels.mean()), 1) for view, pixels in differ.items()}
 
 
-def frames(shown: Renderer, state: Floats, parts: tuple[Part, ...], grey: int) -> dict[str, Frame]:
-    """A frame of each view with the parts painted."""
-    with shown.perturbed([Painted(axis="painted", component="", level=1, parts=parts, grey=grey)]):
-        shown.restore(state, shown.model.site_rgba[:, 3].astype(np.float32))
-        return {name: shown.frame(view.camera) for name, view in SCHEMA.views.items()}
+def frames(renderer: Renderer, state: Floats, parts: tuple[Part, ...], grey: int) -> dict[str, Frame]:
+    """Render a frame of each view with the parts painted."""
+    with renderer.perturbed([Painted(axis="painted", component="", level=1, parts=parts, grey=grey)]):
+        renderer.restore(state, renderer.model.site_rgba[:, 3].astype(np.float32))
+        return {name: renderer.frame(view.camera) for name, view in SCHEMA.views.items()}
 
 
 if __name__ == "__main__":

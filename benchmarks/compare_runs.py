@@ -1,9 +1,10 @@
-"""In what two runs of one configuration differ, such as those of two systems: arrays, files, frames, pixels.
+"""Differences between two runs of one configuration, for example on two systems: arrays, files, frames, pixels.
 
     python benchmarks/compare_runs.py ONE/data/starter OTHER/data/starter
 
-Compares plan, manifest, every array of trajectories and frames, and every file of RLDS and LeRobot by SHA-256. Frames
-that differ are decoded, and their pixels are compared. The last line is JSON; it ends with 1 where anything differs.
+The script compares plan, manifest, every array of trajectories and frames, and every file of RLDS and LeRobot by
+SHA-256. Different frames are decoded, and their pixels are compared. The last line is JSON. The script ends with 1 if
+anything differs.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from pipeline.images import jpeg
 
 
 def frames(data: Path) -> Iterator[tuple[str, bytes]]:
-    """Trajectory, stream and step of each stored frame, and its JPEG file."""
+    """Return ``<trajectory>/<stream>/<step>`` of each stored frame, and its JPEG file."""
     for path in sorted((data / "frames").rglob("*.npz")):
         with np.load(path) as arrays:
             streams = sorted({name.split("/")[1] for name in arrays.files if name.startswith("streams/")})
@@ -33,19 +34,24 @@ def frames(data: Path) -> Iterator[tuple[str, bytes]]:
                     start = end
 
 
-def pixels(one: bytes, other: bytes) -> tuple[int, int]:
-    """How many pixels of two JPEG files differ, and the largest difference in grey levels."""
-    by = np.abs(jpeg.decode(one).astype(int) - jpeg.decode(other)).max(axis=-1)
-    return int(np.count_nonzero(by)), int(by.max())
+def pixels(first: bytes, second: bytes) -> tuple[int, int]:
+    """Return the number of different pixels of two JPEG files, and the largest difference in grey levels."""
+    difference = np.abs(jpeg.decode(first).astype(int) - jpeg.decode(second)).max(axis=-1)
+    return int(np.count_nonzero(difference)), int(difference.max())
+
+
+def checksums(data: Path) -> dict[tuple[str, str], str]:
+    """Return (kind, name) of a run's outputs to their SHA-256."""
+    return {(kind, name): sha256 for kind, name, sha256 in contents(data)}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("one", type=Path, help="folder of a run")
-    parser.add_argument("other", type=Path, help="folder of another")
+    parser.add_argument("other", type=Path, help="folder of another run")
     arguments = parser.parse_args()
-    one, other = ({(kind, name): sha for kind, name, sha in contents(data)} for data in vars(arguments).values())
-    differing = sorted(key for key in one.keys() | other.keys() if one.get(key) != other.get(key))
+    first, second = checksums(arguments.one), checksums(arguments.other)
+    differing = sorted(key for key in first.keys() | second.keys() if first.get(key) != second.get(key))
     for kind, name in differing:
         print("differs:", kind, name)
     stored = dict(frames(arguments.one))
@@ -55,7 +61,7 @@ def main() -> None:
         if stored.get(name, file) != file:
             changed.append(pixels(stored[name], file))
     report = {
-        "compared": Counter(kind for kind, _ in one),
+        "compared": Counter(kind for kind, _ in first),
         "differing": Counter(kind for kind, _ in differing),
         "frames": compared,
         "frames that differ": len(changed),

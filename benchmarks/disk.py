@@ -1,9 +1,9 @@
-"""What a run really takes on the disk: each of its folders when it was largest, in MB.
+"""Disk usage of a run: the largest size of each of its folders, in MB.
 
     nice -n 10 python benchmarks/disk.py configs/starter.yaml
 
-Runs the stages up to `validate` on a configuration, in its own folder, and looks at the folder meanwhile. The last line
-is the result as JSON, beside what `doctor` says before.
+The script runs the stages up to `validate` on a configuration, in its own folder, and measures the folder meanwhile.
+The last line is the result as JSON, with the estimate of `doctor`.
 """
 
 import argparse
@@ -41,8 +41,9 @@ def main() -> None:
 
 
 def folders_mb(data: Path) -> dict[str, float]:
-    """Size of each folder of a run; files that vanish meanwhile count as nothing."""
-    return {folder.name: round(size(folder) / 1e6, 2) for folder in sorted(data.glob("*")) if folder.is_dir()}
+    """Return the size of each folder of a run; files that vanish meanwhile count as 0."""
+    folders = [folder for folder in sorted(data.glob("*")) if folder.is_dir()]
+    return {folder.name: round(size(folder) / 1e6, 2) for folder in folders}
 
 
 def size(folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""A part of a configuration that is small enough to be measured."""
+"""Part of a configuration that is small enough for a measurement."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from pipeline.validation.needs import PUBLISHED
 
 
 def sliced(config: Config, tasks: Sequence[str] | None) -> Config:
-    """One demonstration of each task, and its share of the episodes."""
+    """Reduce a configuration to one demonstration of each task and its share of the episodes."""
     patterns = tuple(tasks or config.demos.tasks)
     chosen = len(select_tasks(patterns))
     per_task = config.demos.per_task or (PUBLISHED if config.demos.source == "hdf5" else 1)

@@ -1,12 +1,15 @@
-"""Episodes an hour of whole commands: `vla-eval run` with its own LIBERO class, and `python -m pipeline evaluate`.
+"""Episodes per hour of whole commands: `vla-eval run` with its own LIBERO class, and `python -m pipeline evaluate`.
 
     python benchmarks/evaluation_throughput.py [--tasks libero_goal/turn_on_the_stove ...] [--states 2]
 
-A model server replays demonstrations for all of them. The same episodes, each to its end, are run by the harness as
-it starts, which is in one process, and by one of its shards on each core; by ours in one process, by one on each
-core, which is how it starts, and so with answers in chunks of eight, where it looks once in eight steps. Imports,
-environments and results are counted. The last line is the result as JSON: wall and CPU seconds, without those of the
-server.
+A model server replays demonstrations for all commands. Every command runs the same episodes to their end:
+
+- the harness in one process, its default, and with one shard on each core;
+- our command in one process, and with one worker on each core, its default;
+- our default with answers in chunks of eight, with one observation per eight steps.
+
+Imports, environments and results are counted. The last line is the result as JSON: wall and CPU seconds, without those
+of the server.
 """
 
 import argparse
@@ -59,13 +62,7 @@ def main() -> None:
                 ratio = figures["harness"][f"{kind}_s"] / figures[name][f"{kind}_s"]
                 figures[name][f"times_faster_{kind}"] = round(ratio, 2)
             print(name, figures[name], flush=True)
-        harness_results = [json.loads(file.read_text()) for file in (out / "harness").rglob("*.json")]
-        figures["harness"]["successes"] = sum(
-            episode["metrics"]["success"]
-            for result in harness_results
-            for task in result["tasks"]
-            for episode in task["episodes"]
-        )
+        figures["harness"]["successes"] = harness_successes(out / "harness")
         for name, results in (("ours", "ours"), (f"ours_look_in_{CHUNK}", "ours_in_chunks")):
             rows = [json.loads(file.read_text()) for file in (out / results / "episodes").glob("*.json")]
             figures[name]["successes"] = sum(row["success"] for row in rows)
@@ -73,39 +70,49 @@ def main() -> None:
     print(json.dumps(figures))
 
 
+def harness_successes(out: Path) -> int:
+    """Count the successful episodes in the harness's result files."""
+    successes = 0
+    for file in out.rglob("*.json"):
+        for task in json.loads(file.read_text())["tasks"]:
+            successes += sum(episode["metrics"]["success"] for episode in task["episodes"])
+    return successes
+
+
 def harness(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Path, shards: int) -> list[list[str]]:
-    """A command of the harness for each shard; its tasks are called by their instructions."""
+    """Return the harness's command for each shard; the harness names tasks by their instructions."""
     out.mkdir()
     suites = dict.fromkeys(suite for suite, _ in tasks)
-    entries = [
-        {
-            "benchmark": "vla_eval.benchmarks.libero.benchmark:LIBEROBenchmark",
-            "subname": suite,
-            "episodes_per_task": states,
-            "tasks": [find_task(*task).instruction for task in tasks if task[0] == suite],
-            "params": {"suite": suite, "env_seed": 0},
-        }
-        for suite in suites
-    ]
+    entries = []
+    for suite in suites:
+        instructions = [find_task(*task).instruction for task in tasks if task[0] == suite]
+        entries.append(
+            {
+                "benchmark": "vla_eval.benchmarks.libero.benchmark:LIBEROBenchmark",
+                "subname": suite,
+                "episodes_per_task": states,
+                "tasks": instructions,
+                "params": {"suite": suite, "env_seed": 0},
+            }
+        )
     config = out / "run.yaml"  # YAML holds JSON.
     config.write_text(json.dumps({"server": {"url": address}, "output_dir": str(out), "benchmarks": entries}))
     program = [sys.executable, "-m", "vla_eval.cli.main", "run", "--no-docker", "--render", "cpu", "-c", str(config)]
     if shards == 1:
         return [program]
-    return [
-        [*program, "--eval-id", "throughput", "--num-shards", str(shards), "--shard-id", str(shard)]
-        for shard in range(shards)
-    ]
+    program += ["--eval-id", "throughput", "--num-shards", str(shards)]
+    return [[*program, "--shard-id", str(shard)] for shard in range(shards)]
 
 
 def ours(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Path, *options: str) -> list[str]:
-    suites, names = (list(dict.fromkeys(column)) for column in zip(*tasks, strict=True))
+    suites = list(dict.fromkeys(suite for suite, _ in tasks))
+    names = list(dict.fromkeys(name for _, name in tasks))
     program = [sys.executable, "-m", "pipeline", "evaluate", str(out), "--server", address, *options]
     return [*program, "--label", out.name, "--suite", *suites, "--task", *names, "--episodes", str(states)]
 
 
 def timed(commands: Sequence[Sequence[str]], episodes: int) -> dict[str, Any]:
-    """Run commands beside each other to their ends."""
+    """Run commands concurrently until all have ended; return their times."""
     cpu_s, start = children_s(), time.perf_counter()
     running = [subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) for command in commands]
     for process in running:
@@ -121,7 +128,7 @@ def timed(commands: Sequence[Sequence[str]], episodes: int) -> dict[str, Any]:
 
 
 def children_s() -> float:
-    """CPU seconds of the processes that have ended."""
+    """Return the CPU seconds of the child processes that have ended."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 

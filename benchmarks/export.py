@@ -1,4 +1,4 @@
-"""Rates and peak memory of the exports on synthetic episodes; the last line printed is JSON."""
+"""Rates and peak memory of the exports on synthetic episodes; the last printed line is JSON."""
 
 import argparse
 import json
@@ -37,7 +37,7 @@ WRITERS = ("rlds", "lerobot_video", "lerobot_images")
 
 
 def synthetic_episode(episode_id: str, steps: int) -> Episode:
-    """Frames of a camera gliding over a smooth texture, about 20 kB a frame as LIBERO's are."""
+    """Generate an episode of a camera gliding over a smooth texture; a frame has about 20 kB, as LIBERO's frames."""
     rng = seeding.rng("benchmark", episode_id)
     height, width, _ = SCHEMA.frame.shape
     noise = rng.integers(0, 256, (height + 64, width + 64, 3), np.uint8)
@@ -48,6 +48,8 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
         return cv2.imencode(".jpg", texture[dy:, dx:][:height, :width], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
     frames = [frame(t) for t in range(steps)]
+    defaults = dict[str, Any](string="", int64=0, float32=0.0)
+    provenance = {column: defaults[dtype] for column, dtype in SCHEMA.provenance.items()}
     return Episode(
         episode_id=episode_id,
         frames=dict.fromkeys(SCHEMA.views, frames),
@@ -55,24 +57,19 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
         joint_state=rng.normal(size=(steps, *SCHEMA.joint_state.shape)).astype(np.float32),
         action=rng.uniform(-1, 1, (steps, *SCHEMA.action.shape)).astype(np.float32),
         instruction="put the black bowl on the plate",
-        provenance={
-            column: dict[str, Any](string="", int64=0, float32=0.0)[dtype]
-            for column, dtype in SCHEMA.provenance.items()
-        }
-        | {"episode_id": episode_id},
+        provenance=provenance | {"episode_id": episode_id},
         geometry=dict.fromkeys(SCHEMA.views, Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))),
     )
 
 
 def replay(episode_id: str, source: Episode) -> Episode:
-    """The same content under another id, so that making episodes costs the exports nothing."""
-    return Episode(
-        **{**vars(source), "episode_id": episode_id, "provenance": {**source.provenance, "episode_id": episode_id}}
-    )
+    """Copy an episode under another id; generating episodes must not slow the exports."""
+    provenance = {**source.provenance, "episode_id": episode_id}
+    return Episode(**{**vars(source), "episode_id": episode_id, "provenance": provenance})
 
 
 def pool_map(pool: ProcessPoolExecutor, fn: Callable[[Any], Any], items: Sequence[Any], description: str) -> list[Any]:
-    """The pipeline's parallel map on a process pool."""
+    """Apply ``fn`` to all items on a process pool, as the pipeline's parallel map."""
     return list(pool.map(fn, items))
 
 
@@ -84,7 +81,10 @@ def dataset(writer: str, out: Path, parts: int) -> Format[Any]:
 
 
 def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, float]:
-    """Rates and memory of one writer; peaks are those of a process's whole life, so each writer gets a new one."""
+    """Measure rates and memory of one writer.
+
+    Peaks cover a process's whole life; therefore each writer runs in a new process.
+    """
     ids = [f"synthetic-{k:05d}" for k in range(episodes)]
     load = partial(replay, source=synthetic_episode(ids[0], steps))
     parts = max(workers, math.ceil(episodes / PER_PART))
@@ -94,17 +94,18 @@ def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, f
             target = dataset(writer, Path(out), parts)
 
             def write(ids: Sequence[str]) -> int:
-                """Bytes of the dataset."""
-                known = Known("libero_spatial", "synthetic", "", load(ids[0]).instruction, steps)
-                export(target, Episodes(dict.fromkeys(ids, known), load), run)
+                """Write the dataset; return its bytes."""
+                facts = Known("libero_spatial", "synthetic", "", load(ids[0]).instruction, steps)
+                export(target, Episodes(dict.fromkeys(ids, facts), load), run)
                 return sum((target.folder / file).stat().st_size for file in target.record().files)
 
             write(ids[:workers])  # imports, in every worker
             start = time.perf_counter()
             size = write(ids)
             seconds = time.perf_counter() - start
-        # The largest of the children that have ended, in KiB.
-        worker, parent = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_CHILDREN, resource.RUSAGE_SELF))
+        # The peak of the largest child that has ended, and of this process, in KiB.
+        worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+        parent = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return {
             "episodes_per_s": round(episodes / seconds, 2),
             "steps_per_s": round(steps * episodes / seconds, 1),

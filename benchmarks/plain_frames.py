@@ -1,12 +1,12 @@
-"""Whether the frames that a finished run stored are those of the plain renderer, byte for byte.
+"""Check that the frames of a finished run equal those of the plain renderer, byte for byte.
 
     nice -n 10 python benchmarks/plain_frames.py data/starter [--every N]
 
-Renders every frame of every stream that is stored of the run's kept episodes once more, without savings
-(PLAIN_RENDERING=1), encodes it as JPEG and compares the bytes. Takes several times as long as the run's stage render;
-``--every N`` compares every N-th frame of each stream. The device must be the run's. Nothing
-is shared with the run's own loop over frames (``rendering/render.py``). The last line is JSON: kept episodes, streams,
-frames compared, and how many differ.
+The script renders every frame of each stored stream of the run's kept episodes again, without savings
+(PLAIN_RENDERING=1). It encodes the frame as JPEG and compares the bytes. It takes several times as long as the run's
+stage render; ``--every N`` compares every N-th frame of each stream. The device must be the run's. No code is shared
+with the run's own loop over frames (``rendering/render.py``). The last line is JSON: kept episodes, streams, frames
+compared, and the number of different frames.
 """
 
 import argparse
@@ -44,14 +44,14 @@ def main() -> None:
     data = arguments.data.resolve()
     config = load(data.resolve() / read_json(data / "configuration.json")["configuration"])
     store, trajectories = FrameStore(data / "frames", config.render), TrajectoryStore(data / "trajectories")
-    shown = shown_of(store.rows())
-    if any(each.device != gl.choose().device for each in shown.values()) or not shown:
+    stored_rows = shown_of(store.rows())
+    if any(stored_row.device != gl.choose().device for stored_row in stored_rows.values()) or not stored_rows:
         raise PipelineError("no current frames, or of another device", where=store.root, expected=gl.choose().device)
     streams: dict[str, dict[str, Stream]] = {}
     episodes = 0
     for row in plan.read(data / "plan.parquet"):
         wanted = {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
-        if row.trajectory_id in shown and wanted.keys() <= shown[row.trajectory_id].streams:
+        if row.trajectory_id in stored_rows and wanted.keys() <= stored_rows[row.trajectory_id].streams:
             streams.setdefault(row.trajectory_id, {}).update(wanted)
             episodes += 1
     frames, different = 0, 0
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def as_stored(renderer: Renderer, stream: Stream, step: int, jpeg_quality: int) -> bytes:
-    """The JPEG file of a stream's frame in the restored state."""
+    """Render a stream's frame in the restored state; return its JPEG file."""
     frame = renderer.frame(SCHEMA.views[stream.view].camera)
     for noise in of_layer(stream.perturbations, PixelPerturbation):
         frame = noise.apply(frame, step)

@@ -1,10 +1,10 @@
-"""Makes two starter tasks with every axis on each Python of the lock, and compares what they wrote.
+"""Comparison of two starter tasks with every axis, generated on each Python of the lock.
 
     python benchmarks/pythons.py /somewhere/else --python 3.11 --python 3.12 --python PATH_OF_A_PYTHON
 
-For each Python uv makes an environment from requirements.lock in that folder, outside of the checkout (8 to 11 GB), and
-the library is installed into it as a wheel that was built from the source distribution. Plan to RLDS run where torch
-cannot be imported. Plan, physics, frames and RLDS must be the same bytes. The last line is JSON.
+For each Python, uv creates an environment from requirements.lock in that folder, outside of the checkout (8 to 11 GB).
+The library is installed as a wheel that is built from the source distribution. The stages from plan to RLDS run without
+an importable torch. Plan, physics, frames and RLDS must have equal bytes. The last line is JSON.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import json
 import os
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from zipfile import ZipFile
@@ -39,13 +40,13 @@ CONFIG = {
 }
 WITHOUT_TORCH = ("doctor", "inputs", "plan", "leakage", "replay", "render", "export_rlds")
 WITH_TORCH = ("export_lerobot", "manifest", "recipe", "validate")
-"""Stages: every one that makes or checks data."""
+"""Stages: all that generate or check data."""
 
 VERSIONS = ("lerobot", "torch", "huggingface-hub", "protobuf", "numpy", "pandas", "pillow")
 
 
 def environment(folder: Path, python: str, wheel: Path) -> Path:
-    """An environment of the lock and the library; returns its Python."""
+    """Create an environment of the lock and the library; return its Python."""
     subprocess.run(["uv", "venv", "--quiet", "--clear", "--python", python, folder], check=True)
     there = os.environ | {"VIRTUAL_ENV": str(folder)}
     lock = REPOSITORY / "requirements.lock"
@@ -55,7 +56,7 @@ def environment(folder: Path, python: str, wheel: Path) -> Path:
 
 
 def make(python: Path, folder: Path, testset: Path) -> None:
-    """A whole run in ``folder``, and first the commands that need none."""
+    """Run all stages in ``folder``, after the commands that need no run."""
     config = folder / "configs" / "pythons.yaml"
     config.parent.mkdir(parents=True)
     config.write_text(yaml.safe_dump(CONFIG))
@@ -74,7 +75,10 @@ def make(python: Path, folder: Path, testset: Path) -> None:
 
 
 def contents(data: Path) -> Iterator[tuple[str, str, str]]:
-    """Kind, name and SHA-256 of what a run made; of stored files only the arrays: attributes name the packages."""
+    """Return kind, name and SHA-256 of a run's outputs.
+
+    Stored files count by their arrays alone, as their attributes name the packages.
+    """
     yield "plan", "plan.parquet", hashlib.sha256((data / "plan.parquet").read_bytes()).hexdigest()
     for kind in ("trajectories", "frames"):
         for path in sorted((data / kind).rglob("*.npz")):
@@ -83,7 +87,8 @@ def contents(data: Path) -> Iterator[tuple[str, str, str]]:
                     if name.endswith(".npy"):
                         yield kind, f"{path.relative_to(data)}/{name}", hashlib.sha256(archive.read(name)).hexdigest()
     for kind in ("rlds", "lerobot"):
-        for path in sorted(path for path in (data / kind).rglob("*") if path.is_file()):
+        files = [path for path in (data / kind).rglob("*") if path.is_file()]
+        for path in sorted(files):
             yield kind, str(path.relative_to(data)), hashlib.sha256(path.read_bytes()).hexdigest()
     yield "manifest", "manifest.parquet", hashlib.sha256((data / "manifest.parquet").read_bytes()).hexdigest()
 
@@ -115,13 +120,15 @@ def main() -> None:
         report[name] = {**versions, **seconds}
         print(name, report[name], flush=True)
     first = next(iter(made.values()))
-    compared = {kind: sum(1 for one, _ in first if one == kind) for kind, _ in first}
-    different = sorted(
-        {key for files in made.values() for key in files.keys() | first.keys() if files.get(key) != first.get(key)}
-    )
+    compared = Counter(kind for kind, _ in first)
+    differing: set[tuple[str, str]] = set()
+    for files in made.values():
+        differing |= {key for key in files.keys() | first.keys() if files.get(key) != first.get(key)}
+    different = sorted(differing)
     for kind, path in different:
         print("differs:", kind, path)
-    counted = {kind: sum(1 for one, _ in different if one == kind) for kind in compared}
+    counts = Counter(kind for kind, _ in different)
+    counted = {kind: counts[kind] for kind in compared}
     print(json.dumps({"pythons": report, "compared": compared, "different": counted}))
     raise SystemExit(bool(different))
 

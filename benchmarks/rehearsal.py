@@ -1,13 +1,14 @@
-"""A whole configuration at its full size, with stand-ins for physics and pixels: what do time and memory grow with?
+"""Growth of time and memory with a configuration's size, up to its full size, with stand-ins for physics and pixels.
 
     nice -n 10 python benchmarks/rehearsal.py [--config configs/full.yaml] [--episodes 1000 28000] [--workers 2]
 
-First 50 demonstrations of eight steps are written for each task. For each size, every stage runs as `dvc repro` calls
-it, with as many episodes in the configuration's proportions, and the demonstrations in proportion too. A replay is
-eight steps that nothing simulates, a frame a pattern that nothing renders (``rehearsal_stand_ins.py``); plan, stores,
-exports, manifest, checks and report are real. The last line is JSON: for each size and stage its seconds, the most
-memory of its own process and of one worker, and how large the run's folder is after it. Stopped, the same command goes
-on with the next stage.
+First, 50 demonstrations of eight steps are written for each task. For each size, every stage runs as `dvc repro` calls
+it. Episodes and demonstrations keep the configuration's proportions. A replay has eight steps without a simulation, and
+a frame is a pattern without rendering (``rehearsal_stand_ins.py``). Plan, stores, exports, manifest, checks and report
+are real.
+
+The last line is JSON, for each size and stage: seconds, the peak memory of the stage's process and of one worker, and
+the size of the run's folder after the stage. After a stop, the same command resumes with the next stage.
 """
 
 import argparse
@@ -43,7 +44,7 @@ STAND_INS = REPOSITORY / "benchmarks" / "rehearsal_stand_ins.py"
 DEMOS = Path("data/rehearsal_demos")
 FIGURES = Path("data/rehearsal_figures")
 LOOK_S = 0.5
-"""How often memory is looked at."""
+"""Interval between two measurements of memory."""
 
 
 def main() -> None:
@@ -61,7 +62,7 @@ def main() -> None:
 
 
 def demonstrations(wanted: DemosConfig) -> None:
-    """Write demonstrations of every task, all different, in the scene of the starter set's one."""
+    """Write different demonstrations of every task, in the scene of the starter set's demonstration."""
     starter = StarterSource()
     for task in select_tasks(wanted.tasks):
         path = DEMOS / task.suite / f"{task.name}_demo.hdf5"
@@ -75,7 +76,7 @@ def _recordings(task: Task, starter: StarterSource) -> Iterator[hdf5.Recording]:
     demo = starter.of(task)
     model_xml = demo.model_xml or shared(task).place_fixtures(0)
     for number in range(PUBLISHED):
-        noise = seeding.rng("rehearsal", number).normal(0, [*[0.01] * 6, 0], (STEPS, 7))  # None on the gripper.
+        noise = seeding.rng("rehearsal", number).normal(0, [*[0.01] * 6, 0], (STEPS, 7))  # no noise on the gripper
         actions = np.clip(demo.actions[:STEPS] + noise, -1, 1)
         states = np.repeat(demo.init_state[None], STEPS, axis=0)
         yield hdf5.Recording(actions, states, np.zeros((STEPS, 9)), model_xml, {})
@@ -98,35 +99,39 @@ def configuration(source: Path, episodes: int, workers: int) -> Path:
 
 
 def stages() -> list[str]:
-    """Names of the stages in the order in which `dvc repro` runs them."""
+    """Return the names of the stages in the order in which `dvc repro` runs them."""
     return list(yaml.safe_load((REPOSITORY / "dvc.yaml").read_text())["stages"])
 
 
 def measured(stage: str, config: Path) -> dict[str, Any]:
-    """Run a stage, or look up what it took where it has run."""
+    """Run and measure a stage, or read its figures if it has run before."""
     record, data = FIGURES / config.stem / f"{stage}.json", Path("data") / config.stem
     if record.exists():
         return dict(json.loads(record.read_text()))
+    folders = (str(REPOSITORY), os.environ.get("PYTHONPATH"))
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))),
+        "PYTHONPATH": os.pathsep.join(filter(None, folders)),
         "DASK_DISTRIBUTED__WORKER__PRELOAD": json.dumps([str(STAND_INS)]),
     }
     command = [sys.executable, str(STAND_INS), str(REPOSITORY / "stages" / f"{stage}.py"), str(config)]
     start = time.perf_counter()
     with subprocess.Popen(command, env=environment, stdout=sys.stderr) as process:
-        own, worker = 0, 0
+        stage_peak, worker_peak = 0, 0
         while process.poll() is None:
-            first, *others = [*_memory(process.pid), 0]
-            own, worker = max(own, first), max(worker, *others, 0)
+            stage_bytes, *children_bytes = [*_memory(process.pid), 0]
+            stage_peak = max(stage_peak, stage_bytes)
+            worker_peak = max(worker_peak, *children_bytes, 0)
             time.sleep(LOOK_S)
     if process.returncode:
         raise SystemExit(f"{stage} of {config} ended with {process.returncode}")
+    seconds = time.perf_counter() - start
+    data_bytes = sum(file.stat().st_size for file in data.rglob("*") if file.is_file())
     figures = {
-        "s": round(time.perf_counter() - start, 1),
-        "own_mb": round(own / 1e6),
-        "worker_mb": round(worker / 1e6),
-        "data_mb": round(sum(file.stat().st_size for file in data.rglob("*") if file.is_file()) / 1e6),
+        "s": round(seconds, 1),
+        "own_mb": round(stage_peak / 1e6),
+        "worker_mb": round(worker_peak / 1e6),
+        "data_mb": round(data_bytes / 1e6),
     }
     print(f"{config.stem} {stage} {figures}", file=sys.stderr, flush=True)
     with replaced(record) as temporary:
@@ -135,7 +140,7 @@ def measured(stage: str, config: Path) -> dict[str, Any]:
 
 
 def _memory(pid: int) -> Iterator[int]:
-    """Resident bytes of a process, and of each below it."""
+    """Return the resident bytes of a process, then of each of its descendants."""
     try:
         root = psutil.Process(pid)
         for process in (root, *root.children(recursive=True)):

@@ -1,8 +1,8 @@
-"""A stage of a run whose physics and pixels are stand-ins; everything else is the stage itself.
+"""Stage of a run with stand-ins for physics and pixels; all other code is the stage's own.
 
     python benchmarks/rehearsal_stand_ins.py stages/replay.py configs/NAME.yaml
 
-Eight steps take the place of a replay, and smooth patterns that of frames. Dask's workers load this file as they start
+Eight steps replace a replay, and smooth patterns replace frames. Dask's workers load this file as they start
 (``distributed.worker.preload``).
 """
 
@@ -31,9 +31,9 @@ from pipeline.types import Demo, Frame, Geometry, Rendered, Scene, Task, Traject
 from pipeline.validation.checks import ARM
 
 STEPS = 8
-"""The fewest that OpenVLA-OFT can read: one of its chunks."""
+"""Shortest episode that OpenVLA-OFT can read: one of its chunks."""
 DROPPED = 0.1
-"""So many perturbed replays fail."""
+"""Share of the perturbed replays that fail."""
 
 
 def replay(
@@ -44,7 +44,7 @@ def replay(
     perturbations: Sequence[PhysicsPerturbation],
     reference: object,
 ) -> Trajectory:
-    """A robot that stands still in the demonstration's scene."""
+    """Return the trajectory of a robot that stands still in the demonstration's scene."""
     rng = seeding.rng("rehearsal", trajectory_id)
     states = np.repeat(demo.init_state[None], STEPS + 1, axis=0)
     states[:, 0] = np.arange(STEPS + 1) / SCHEMA.fps_hz
@@ -66,8 +66,14 @@ def replay(
 def render(
     trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig, opened: object
 ) -> Rendered:
-    """A pattern of its own for each stream and step."""
+    """Return frames with a different pattern for each stream and step."""
     steps = len(trajectory.actions)
+    streams_of_frames: dict[str, list[bytes]] = {}
+    for stream in streams:
+        patterns = [_pattern(f"{stream.stream_id} {step}") for step in range(steps)]
+        streams_of_frames[stream.stream_id] = [encode(pattern, config) for pattern in patterns]
+    geometries = {stream.geometry for stream in streams}
+    fixed = Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
     state = np.zeros((steps, 8), np.float32)
     state[:, 6:] = 0.04, -0.04
     return Rendered(
@@ -75,14 +81,8 @@ def render(
         state=state,
         joint_state=trajectory.states[:-1, ARM].astype(np.float32),
         action=trajectory.actions.astype(np.float32),
-        streams={
-            stream.stream_id: [encode(_pattern(f"{stream.stream_id} {step}"), config) for step in range(steps)]
-            for stream in streams
-        },
-        geometry={
-            geometry.stream_id: Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
-            for geometry in {stream.geometry for stream in streams}
-        },
+        streams=streams_of_frames,
+        geometry={geometry.stream_id: fixed for geometry in geometries},
         quality=trajectory.quality,
     )
 
@@ -94,7 +94,7 @@ def _pattern(name: str) -> Frame:
 
 
 def put_in() -> None:
-    """Have this process work with the stand-ins."""
+    """Install the stand-ins in this process."""
     for module, name, stand_in in (
         (pipeline.run.replay_job, "shared", lambda task: None),
         (pipeline.run.replay_job, "replay", replay),
@@ -105,14 +105,14 @@ def put_in() -> None:
 
 
 def dask_setup(worker: object) -> None:
-    """What Dask calls in a worker that starts."""
+    """Install the stand-ins in a Dask worker; Dask calls this function when the worker starts."""
     put_in()
 
 
 if __name__ == "__main__":
     sys.argv = sys.argv[1:]
     if Path(sys.argv[0]).stem == "doctor":
-        # It steps and renders for some seconds, whatever the size; the disk is not going to be filled.
+        # doctor steps and renders for some seconds, whatever the size; the disk is not going to be filled.
         vars(pipeline.validation.doctor)["needed_mb"] = lambda config: {}
     else:
         put_in()

@@ -1,14 +1,17 @@
-"""The render stage by one worker and by several, beside the bare drawing of its frames.
+"""Comparison of the render stage with one worker, with several workers, and of the bare rendering of its frames.
 
     python benchmarks/render_workers.py [--config configs/starter.yaml] [--tasks 'libero_goal/put_the_bowl_*' ...]
 
-Takes a demonstration of the starter set for each task, and as many episodes as the configuration asks for each
+The script takes one demonstration of the starter set for each task, and the configuration's number of episodes for each
 demonstration. They are replayed once. Then the frames are rendered three times: in this process, where the time within
-``Renderer.frame`` is counted, by one worker process, and by several, each drawing with one thread. Run it on a machine
-that does nothing else, with tasks of scenes that are alike: the streams of a demonstration are one job, and of two jobs
-that differ, one worker waits for the other. The last line is JSON: seconds by the clock, the start of the workers left
-out, and of CPU time for the bare drawing, as one process draws on little more than one core; what the workers together
-take against both; and how many times faster several are than one.
+``Renderer.frame`` is counted, with one worker process, and with several. Each renders with one thread.
+
+Run the script on an otherwise idle machine, with tasks of similar scenes. The streams of a demonstration are one job;
+if two jobs differ, one worker waits for the other.
+
+The last line is JSON. Wall seconds exclude the start of the workers. Bare rendering has CPU seconds too, as one process
+renders on little more than one core. The other figures are the time of all workers relative to bare rendering, and the
+speed-up of several workers over one.
 """
 
 import argparse
@@ -66,11 +69,12 @@ def main() -> None:
         by_workers = {}
         for workers in (1, arguments.workers):
             config_of_workers = ComputeConfig(cluster="local", workers=workers)
-            # A worker that has cores to spare would draw with as many threads.
+            # With spare cores, a worker would render with several threads.
             with patch("dask.system.CPU_COUNT", workers), runner(config_of_workers, root, renders=True) as run:
                 run(_warm, range(4 * workers), "workers")
                 by_workers[workers] = rendered(run, f"by_{workers}")
-    (bare_s, bare_cpu_s), several_s = map(sum, zip(*drawn_s, strict=True)), by_workers[arguments.workers]
+    bare_s, bare_cpu_s = map(sum, zip(*drawn_s, strict=True))
+    several_s = by_workers[arguments.workers]
     print(
         json.dumps(
             {
@@ -89,7 +93,7 @@ def main() -> None:
 
 
 def _warm(number: int) -> None:
-    """Have a worker import what rendering needs."""
+    """Import the modules of rendering in a worker."""
     import pipeline.rendering.render  # noqa: F401
 
     time.sleep(0.2)

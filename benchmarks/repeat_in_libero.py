@@ -1,12 +1,13 @@
-"""Every kept trajectory of a run once more in LIBERO's own environment: the same states, bit for bit, and the goal.
+"""Repetition of a run's kept trajectories in LIBERO's own environment: equal states, bit for bit, and the goal.
 
     nice -n 10 python benchmarks/repeat_in_libero.py data/starter [--limit 10]
     nice -n 10 python benchmarks/repeat_in_libero.py data/demos
 
-The folder is a finished run's, or one that ``demos expand`` wrote, of which the HDF5 files are read. Each is put where
-its replay started, settles, and is sent the stored actions by LIBERO's own ``step``; nothing of ``pipeline/physics/``
-takes part, and nothing is rendered. A name is printed for each trajectory that differs. The last line is JSON: how many
-there are by what is perturbed, and how many were repeated. 30 took 1.5 minutes of CPU.
+The folder belongs to a finished run, or ``demos expand`` wrote it; then its HDF5 files are read. The environment starts
+where the replay started, settles, and gets the stored actions through LIBERO's own ``step``. No code of
+``pipeline/physics/`` is used, and nothing is rendered. The name of each trajectory that differs is printed. The last
+line is JSON: the number of trajectories by perturbed component, and the number of equal ones. 30 trajectories took 1.5
+minutes of CPU.
 """
 
 import argparse
@@ -32,7 +33,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Floats, Scene, Task
 
 STEP_S = 0.05
-"""What a control step takes, by which the states tell how many steps the scene settled."""
+"""Duration of a control step; the times of the states give the number of settling steps."""
 
 
 def main() -> None:
@@ -40,17 +41,18 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="a finished run's folder, or one of demonstrations")
     parser.add_argument("--limit", type=int, help="trajectories; all when left out")
     arguments = parser.parse_args()
-    found = (
-        _of_run(arguments.data) if (arguments.data / "plan.parquet").exists() else _of_demonstrations(arguments.data)
-    )
+    is_run = (arguments.data / "plan.parquet").exists()
+    trajectories = _of_run(arguments.data) if is_run else _of_demonstrations(arguments.data)
     tried: Counter[str] = Counter()
     equal: Counter[str] = Counter()
     env, task = None, None
-    for done in islice(found, arguments.limit):
-        if task != (task := done.task):
-            env = opened(task)
+    for done in islice(trajectories, arguments.limit):
+        if task != done.task:
+            env = opened(done.task)
+        task = done.task
         tried[done.what] += 1
-        if (difference := repeated(env, done)) is None:
+        difference = repeated(env, done)
+        if difference is None:
             equal[done.what] += 1
         else:
             print(f"{done.name} ({done.what}, {task.suite}/{task.name}): {difference}")
@@ -60,7 +62,7 @@ def main() -> None:
 
 
 class Done(NamedTuple):
-    """What was done once: actions (K, 7) from a scene; states (K+1, S), or (K, S) without the one after the last."""
+    """A finished trajectory: actions (K, 7) from a scene; states (K+1, S), or (K, S) without the final state."""
 
     task: Task
     what: str
@@ -74,18 +76,19 @@ def _of_run(folder: Path) -> Iterator[Done]:
     store = TrajectoryStore(folder / "trajectories")
     replayed = store.rows()
     rows = {row.trajectory_id: row for row in plan.read(folder / "plan.parquet")}
-    kept = (row for name, row in rows.items() if name in replayed and replayed[name]["kept"])
+    kept = [row for name, row in rows.items() if name in replayed and replayed[name]["kept"]]
     for row in sorted(kept, key=lambda row: (row.suite, row.task)):
         trajectory = store.load(row.trajectory_id)
         # Episodes that change no physics share the clean twin's trajectory.
         what = row.component if trajectory.resolved != "{}" else "clean"
-        task, done = find_task(row.suite, row.task), (trajectory.scene, trajectory.states, trajectory.actions)
-        yield Done(task, what, row.trajectory_id, *done)
+        task = find_task(row.suite, row.task)
+        yield Done(task, what, row.trajectory_id, trajectory.scene, trajectory.states, trajectory.actions)
 
 
 def _of_demonstrations(root: Path) -> Iterator[Done]:
     source, files = HDF5Source(root), sorted(root.glob("*/*_demo.hdf5"))
-    for task in (find_task(file.parent.name, file.name.removesuffix("_demo.hdf5")) for file in files):
+    for file in files:
+        task = find_task(file.parent.name, file.name.removesuffix("_demo.hdf5"))
         for entry in source.index([task]).entries:
             demo = source.load(entry.demo_id)
             scene = recorded_start(demo, str(demo.model_xml), settles=False)
@@ -93,7 +96,7 @@ def _of_demonstrations(root: Path) -> Iterator[Done]:
 
 
 def opened(task: Task) -> Any:
-    """LIBERO's environment of a task, without a renderer."""
+    """Open LIBERO's environment of a task, without a renderer."""
     from libero.libero.envs.env_wrapper import ControlEnv
     from robosuite.utils.errors import RandomizationError
 
@@ -108,7 +111,7 @@ def opened(task: Task) -> Any:
 
 
 def repeated(env: Any, done: Done) -> str | None:
-    """Do it again in LIBERO's ``ControlEnv`` of its task; what was otherwise, or None."""
+    """Repeat a trajectory in LIBERO's ``ControlEnv`` of its task; return the first difference, or ``None``."""
     put_in(env, done.scene)
     settled = round((done.states[0, 0] - done.scene.state[0]) / STEP_S)
     for _ in range(settled):
@@ -116,7 +119,8 @@ def repeated(env: Any, done: Done) -> str | None:
     if not np.array_equal(env.get_sim_state(), done.states[0]):
         return f"another first look after {settled} steps"
     for number, action in enumerate(done.actions, 1):
-        if (push := done.scene.push) is not None:
+        push = done.scene.push
+        if push is not None:
             acts = push.first_step < number <= push.first_step + push.steps
             env.sim.data.xfrc_applied[env.sim.model.body_name2id(push.body)] = push.wrench if acts else 0.0
         env.step(action)
@@ -126,14 +130,14 @@ def repeated(env: Any, done: Done) -> str | None:
 
 
 def put_in(env: Any, scene: Scene) -> None:
-    """Start LIBERO's environment where a replay starts, which is more than a state: ``Scene`` says what.
+    """Start LIBERO's environment where a replay starts; a start is more than a state, see ``Scene``.
 
-    The solver starts from its last result, so that these are the steps of ``Environment.restore``, in its order.
+    The solver starts from its last result. The steps and their order are therefore those of ``Environment.restore``.
     """
     env.reset_from_xml_string(scene.model_xml)
     sim, robot = env.sim, env.robots[0]
     arm, speeds = robot._ref_joint_pos_indexes, robot._ref_joint_vel_indexes
-    # Of both fingers.
+    # The last gripper command of both fingers.
     robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
     sim.reset()
     env.set_state(scene.state)

@@ -1,9 +1,9 @@
-"""How many replays reach their goal, open-loop and in ``auto``, by suite, axis and level; and how smooth they are.
+"""Share of replays that reach their goal, open-loop and in ``auto``, by suite, axis and level; and their smoothness.
 
     nice -n 10 python benchmarks/replay_yield.py [--draws 1] [--axes initial_joints scene layout] [--levels 1 3 5]
 
-Draws come from the planner, over the starter demonstrations; ``--folder`` keeps the trajectories, so that a run that
-was stopped goes on where it was. The last line is the result as JSON.
+The planner samples the perturbations, over the starter demonstrations. ``--folder`` keeps the trajectories; a stopped
+run resumes from them. The last line is the result as JSON.
 """
 
 import argparse
@@ -45,9 +45,9 @@ AXES: dict[str, tuple[str, dict[str, Any]]] = {
     "layout": ("layout", {}),
     "disturbance": ("disturbance", {}),
 }
-"""What is measured to its axis and the options of that."""
+"""Name of a measurement to its axis and the axis's options."""
 SATURATED = 0.93
-"""The largest action that a demonstrator's input device gives is 0.9375."""
+"""Smallest action that counts as saturated; a demonstrator's input device gives at most 0.9375."""
 
 REPLAY = ReplayConfig(mode="auto")
 
@@ -85,7 +85,10 @@ def main() -> None:
 
 
 def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """A line for each axis and level. Draws that the scene refuses are counted apart, as they cost no replay."""
+    """Return a line for each axis and level.
+
+    Perturbations that the scene rejects are counted separately, as they cost no replay.
+    """
     reasons: dict[tuple[str, int], dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
     for row in rows:
         level: int = from_json(row.perturbations)[0].level if row.perturbations != "[]" else 0
@@ -94,7 +97,7 @@ def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) 
         if not outcome["steps"]:
             reason = f"refused: {reason}"
         elif reason == "kept":
-            # In `auto`, what is kept as tracked has failed open-loop before.
+            # In `auto`, a replay is tracked only after it has failed open-loop.
             reason = mode
         measured = row.component if row.component in AXES else row.axis
         reasons[measured, level][row.suite][reason] += 1
@@ -106,10 +109,11 @@ def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) 
         for mode, kept in (("open_loop", ("open_loop",)), ("auto", ("open_loop", "tracked"))):
             number = sum(total[reason] for reason in kept)
             line[mode] = {"kept": number, "interval": _interval(number, tried)}
-            for suite, of in by_suite.items():
-                valid = sum(n for reason, n in of.items() if not reason.startswith("refused"))
-                own = sum(of[reason] for reason in kept)
-                line[mode] |= {suite: f"{own}/{valid}", f"{suite}_interval": _interval(own, valid)}
+            for suite, of_suite in by_suite.items():
+                valid = sum(n for reason, n in of_suite.items() if not reason.startswith("refused"))
+                kept_in_suite = sum(of_suite[reason] for reason in kept)
+                interval = _interval(kept_in_suite, valid)
+                line[mode] |= {suite: f"{kept_in_suite}/{valid}", f"{suite}_interval": interval}
         line["dropped"] = {reason: n for reason, n in total.items() if reason not in ("open_loop", "tracked")}
         lines.append(line)
     return lines
@@ -118,36 +122,38 @@ def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) 
 def _shapes(
     rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]], store: TrajectoryStore
 ) -> Iterator[dict[str, float]]:
-    """How each tracked replay compares with what the demonstrator did, as ratios."""
+    """Return the ratios of each tracked replay's smoothness to that of its demonstration's clean twin."""
     twins = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
     for row in rows:
         outcome = replayed[row.trajectory_id]
         if outcome["kept"] and outcome["mode"] == "tracked":
             task = find_task(row.suite, row.task)
-            own, twin = (_shape(store, one, task) for one in (row.trajectory_id, twins[row.demo_id]))
-            ratios = {name: own[name] / twin[name] for name in own if name != "saturated"}
-            yield ratios | {"saturated": own["saturated"], "saturated_twin": twin["saturated"]}
+            tracked, twin = _shape(store, row.trajectory_id, task), _shape(store, twins[row.demo_id], task)
+            ratios = {name: tracked[name] / twin[name] for name in tracked if name != "saturated"}
+            yield ratios | {"saturated": tracked["saturated"], "saturated_twin": twin["saturated"]}
 
 
 def _displaced_cm(
     rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]], store: TrajectoryStore
 ) -> dict[int, list[float]]:
-    """Level of pushes to how far, at most, they put the hand from the twin's, until half a second after them.
+    """Return level of pushes to the largest distance of the hand from the clean twin's hand, in cm.
 
-    Tenth, fiftieth and ninetieth percentile of those that are kept.
+    The time ends half a second after the push. The numbers are the tenth, fiftieth and ninetieth percentile of the kept
+    episodes.
     """
     twins = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
-    found: dict[int, list[float]] = defaultdict(list)
+    largest_cm: dict[int, list[float]] = defaultdict(list)
     for row in rows:
         if row.axis == "disturbance" and replayed[row.trajectory_id]["kept"]:
             pushed, twin = store.load(row.trajectory_id), store.load(twins[row.demo_id])
             push = pushed.scene.push
             assert push is not None
             steps = slice(push.first_step, min(push.first_step + push.steps + 10, len(twin.actions)))
-            hands = [Reference.of(one.model_xml, one.states[steps], one.actions[steps]) for one in (pushed, twin)]
-            away_m = np.linalg.norm(hands[0].positions_m - hands[1].positions_m, axis=1)
-            found[int(row.level)].append(100 * float(away_m.max()))
-    return {level: np.percentile(cm, [10, 50, 90]).round(1).tolist() for level, cm in sorted(found.items())}
+            hand_pushed = Reference.of(pushed.model_xml, pushed.states[steps], pushed.actions[steps])
+            hand_twin = Reference.of(twin.model_xml, twin.states[steps], twin.actions[steps])
+            away_m = np.linalg.norm(hand_pushed.positions_m - hand_twin.positions_m, axis=1)
+            largest_cm[int(row.level)].append(100 * float(away_m.max()))
+    return {level: np.percentile(cm, [10, 50, 90]).round(1).tolist() for level, cm in sorted(largest_cm.items())}
 
 
 @cache
@@ -161,8 +167,11 @@ def _shape(store: TrajectoryStore, trajectory_id: str, task: Task) -> dict[str, 
 
 
 def _medians(shapes: Sequence[dict[str, float]]) -> dict[str, float]:
-    names = shapes[0] if shapes else ()
-    return {"replays": len(shapes)} | {n: round(float(np.median([shape[n] for shape in shapes])), 3) for n in names}
+    medians: dict[str, float] = {"replays": len(shapes)}
+    for name in shapes[0] if shapes else ():
+        values = [shape[name] for shape in shapes]
+        medians[name] = round(float(np.median(values)), 3)
+    return medians
 
 
 def _interval(kept: int, tried: int) -> tuple[float, float]:
@@ -173,11 +182,11 @@ def _interval(kept: int, tried: int) -> tuple[float, float]:
 def _print(lines: Sequence[Mapping[str, Any]]) -> None:
     table = Table("axis", "level", "mode", *SUITES[:4], "all", "95 %", "dropped")
     for line, mode in product(lines, ("open_loop", "auto")):
-        of = line[mode]
-        suites = [of.get(suite, "-") for suite in SUITES[:4]]
-        kept = f"{of['kept']}/{line['tried']}"
+        of_mode = line[mode]
+        suites = [of_mode.get(suite, "-") for suite in SUITES[:4]]
+        kept = f"{of_mode['kept']}/{line['tried']}"
         dropped = ", ".join(f"{reason} {number}" for reason, number in line["dropped"].items())
-        table.add_row(line["axis"], str(line["level"]), mode, *suites, kept, str(of["interval"]), dropped)
+        table.add_row(line["axis"], str(line["level"]), mode, *suites, kept, str(of_mode["interval"]), dropped)
     Console(stderr=True, width=180).print(table)
 
 

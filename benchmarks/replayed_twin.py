@@ -1,4 +1,4 @@
-"""A demonstration replayed once, for benchmarks that render it again and again."""
+"""Single replay of a demonstration, for benchmarks that render it repeatedly."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from pipeline.types import Trajectory
 
 
 def replayed_twin(config: Config, task: str, folder: Path) -> Trajectory:
-    """The clean replay of a task's first demonstration, which ``folder`` has under its trajectory's id."""
+    """Replay a task's first demonstration unperturbed; ``folder`` stores it under its trajectory's id."""
     demos = config.demos.model_copy(update={"tasks": (task,)})
     twin = plan.twins(demos.index().entries, config.plan.seed, config.replay)[0]
     Replays(demos, config.replay, folder, loop).of([twin])

@@ -1,10 +1,9 @@
-"""Starts at resets: how many of each task's replays reach the goal, and how the starts compare with LIBERO's own.
+"""Starts at resets: the yield of each task's replays, and the spread of the starts compared with LIBERO's own.
 
     nice -n 10 python benchmarks/reset_starts.py FOLDER [--starts 3] [--tasks 'libero_goal/*']
 
-Each start is tried once, as ``demos expand --starts reset`` tries it. The trajectories stay in FOLDER, so that a run
-that was stopped goes on where it was. LIBERO's own starts are the 50 initial states of each task. The last line is the
-result as JSON.
+Each start is tried once, as in ``demos expand --starts reset``. The trajectories stay in FOLDER; a stopped run resumes
+from them. LIBERO's own starts are the 50 initial states of each task. The last line is the result as JSON.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,42 +48,46 @@ def main() -> None:
     planned = {entry.task: plan.resets([entry], arguments.starts, 0.0, SEED, REPLAY) for entry in demos.index().entries}
     store = TrajectoryStore(arguments.folder)
     with runner(ComputeConfig(workers=arguments.workers), Path("data")) as run:
-        Replays(demos, REPLAY, store.root, run).of([row for rows in planned.values() for row in rows])
+        Replays(demos, REPLAY, store.root, run).of([*chain.from_iterable(planned.values())])
     yields, ours, libero = {}, [], []
     for task, rows in planned.items():
-        human, *replays = (store.load(row.trajectory_id) for row in rows)
+        human, *replays = [store.load(row.trajectory_id) for row in rows]
         yields[f"{task.suite}/{task.name}"] = _yield(human, replays, task)
         starts = np.stack([replay.states[0] for replay in replays])
         ours.append(_Starts.of(starts, human.model_xml))
         libero.append(_Starts.of(libero_states(task), human.model_xml))
-    lengths = [steps / of["human_steps"] for of in yields.values() for steps in of["steps"]]
+    lengths: list[float] = []
+    for task_yield in yields.values():
+        lengths += [steps / task_yield["human_steps"] for steps in task_yield["steps"]]
+    percentiles = {f"{share}%": round(float(np.percentile(lengths, share)), 2) for share in (0, 10, 50, 90, 100)}
     result = {
-        "kept": sum(of["kept"] for of in yields.values()),
-        "tried": sum(of["tried"] for of in yields.values()),
+        "kept": sum(task_yield["kept"] for task_yield in yields.values()),
+        "tried": sum(task_yield["tried"] for task_yield in yields.values()),
         "starts": {"reset": _spread(ours), "libero": _spread(libero)},
-        "length_of_human": {
-            f"{share}%": round(float(np.percentile(lengths, share)), 2) for share in (0, 10, 50, 90, 100)
-        },
+        "length_of_human": percentiles,
         "tasks": yields,
     }
     print(json.dumps(result))
 
 
 def _yield(human: Trajectory, replays: list[Trajectory], task: Task) -> dict[str, Any]:
-    """What became of the replays of a task; kept is what reached the goal and moved about as smoothly as the human."""
+    """Count the outcomes of a task's replays.
+
+    A replay is kept if it reaches the goal and moves about as smoothly as the human.
+    """
     reasons: Counter[str] = Counter()
     steps = []
     for replay in replays:
         reason = replay.verdict.reason
         if replay.verdict.kept:
-            own, reference = smoothness(replay, task), smoothness(human, task)
-            rough = any(own[name] > limit * reference[name] for name, limit in ROUGH.items())
+            measured, reference = smoothness(replay, task), smoothness(human, task)
+            rough = any(measured[name] > limit * reference[name] for name, limit in ROUGH.items())
             reason = "not_smooth" if rough else reason
         reasons[reason] += 1
         if reason == "kept":
             steps.append(len(replay.actions))
-    found = {"tried": len(replays), "kept": reasons.pop("kept", 0), "steps": steps, "human_steps": len(human.actions)}
-    return found | {"human": human.verdict.reason, "dropped": dict(reasons)}
+    counts = {"tried": len(replays), "kept": reasons.pop("kept", 0), "steps": steps, "human_steps": len(human.actions)}
+    return counts | {"human": human.verdict.reason, "dropped": dict(reasons)}
 
 
 class _Starts(NamedTuple):
@@ -101,7 +105,7 @@ class _Starts(NamedTuple):
 
 
 def _spread(of_tasks: list[_Starts]) -> dict[str, float]:
-    """Standard deviations, of the joints about home and of an object's x and y about their mean in its task."""
+    """Return standard deviations of the joints about home, and of an object's x and y about their mean in its task."""
     joints = np.concatenate([starts.joints_rad for starts in of_tasks])
     norms = np.linalg.norm(joints, axis=1)
     variances = np.concatenate([starts.objects_m.var(axis=0, ddof=1).ravel() for starts in of_tasks])

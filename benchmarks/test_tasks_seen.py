@@ -1,10 +1,10 @@
-"""What a policy sees in LIBERO's and LIBERO-Plus's evaluations, for `python -m pipeline analyse coverage`.
+"""Measures of the observations in LIBERO's and LIBERO-Plus's evaluations, for `python -m pipeline analyse coverage`.
 
     nice -n 10 python benchmarks/test_tasks_seen.py > pipeline/testset/seen.json
 
-First looks are those of all 40 tasks, from their first initial state. Robot starts are those of one test task of each
-of the 40 at each level. A working surface and the walls are counted in the first look of one task of each arena, and
-noise at the severities 1, 5 and 10 is laid on these looks. It takes about ten minutes without a GPU.
+First observations come from the first initial state of all 40 tasks. Robot starts come from one test task per task and
+level. The pixels of working surface and walls are counted in the first observation of one task of each arena. Noise of
+the severities 1, 5 and 10 is applied to these observations. The script takes about ten minutes without a GPU.
 """
 
 import json
@@ -35,20 +35,22 @@ from pipeline.types import Task  # noqa: E402
 
 SEVERITIES = (1, 5, 10)
 WALLS = ("walls_mat", "kitchen_background")
-"""Materials of what stands around the working surface."""
+"""Materials of the walls around the working surface."""
 
 
 def main() -> None:
     values: dict[str, list[float]] = defaultdict(list)
     looks: dict[tuple[str, str], Look] = {}
-    shown: set[str] = set()
-    for task in (task for suite in benchmark.TESTED_SUITES for task in tasks(suite)):
+    measured_arenas: set[str] = set()
+    all_tasks = [task for suite in benchmark.TESTED_SUITES for task in tasks(suite)]
+    for task in all_tasks:
         with closing(Simulator(task)) as simulator:
             simulator.start(0, libero_states(task)[0])
             look = looks[task.suite, task.name] = Look.of(simulator.model, simulator.state)
             measured = list(look.measures().items())
-            if (arena := bddl.read(task.bddl_file).arena) not in shown:
-                shown.add(arena)
+            arena = bddl.read(task.bddl_file).arena
+            if arena not in measured_arenas:
+                measured_arenas.add(arena)
                 measured += _frames(simulator, arena)
             for number, test in _robot_starts(task):
                 simulator.start(0, libero_states(task)[0], libero_plus.postures_rad()[number])
@@ -62,7 +64,7 @@ def main() -> None:
 
 
 def _robot_starts(task: Task) -> list[tuple[int, TestTask]]:
-    """The first robot test task of each level that perturbs a task, by the number of its posture."""
+    """Return (posture number, test) of the first robot test task of each level that perturbs a task."""
     chosen: dict[int, TestTask] = {}
     for test in benchmark.load().on(task, "robot"):
         chosen.setdefault(level_of_test(test), test)
@@ -70,20 +72,22 @@ def _robot_starts(task: Task) -> list[tuple[int, TestTask]]:
 
 
 def _frames(simulator: Simulator, arena: str) -> Iterator[tuple[str, float]]:
-    """What a test task of background changes in each view, and how much noise there is in the agent view."""
+    """Measure the share of each view that background test tasks change, and the noise of the agent view."""
     renderer = Renderer(simulator.model)
     model, surface = simulator.model, "floor" if arena == "floor" else "table"
     renderer.restore(simulator.state, simulator.site_alpha)
     for view, spec in SCHEMA.views.items():
         geoms = renderer.geoms(spec.camera)
         bodies = [model.body(model.body_rootid[model.geom_bodyid[geom]]).name for geom in range(model.ngeom)]
-        materials = [model.mat(mat).name if (mat := model.geom_matid[geom]) >= 0 else "" for geom in range(model.ngeom)]
-        on_surface = np.isin(geoms, [geom for geom, body in enumerate(bodies) if body.endswith(surface)])
-        around = np.isin(geoms, [geom for geom, material in enumerate(materials) if material in WALLS])
+        materials = [model.mat(material).name if material >= 0 else "" for material in model.geom_matid]
+        surface_geoms = [geom for geom, body in enumerate(bodies) if body.endswith(surface)]
+        wall_geoms = [geom for geom, material in enumerate(materials) if material in WALLS]
+        on_surface, around = np.isin(geoms, surface_geoms), np.isin(geoms, wall_geoms)
         yield f"background: share of {view} that surface changes", float(on_surface.mean())
         yield f"background: share of {view} that theme changes", float((on_surface | around).mean())
     clean = renderer.frame("agentview")
-    for test in {(t.component, t.parameters["severity"]): t for t in benchmark.load().of("noise")}.values():
+    tests = {(test.component, test.parameters["severity"]): test for test in benchmark.load().of("noise")}
+    for test in tests.values():
         if test.parameters["severity"] in SEVERITIES:
             noisy = libero_plus.noise(test, 0).apply(clean, 0)
             yield f"noise: {test.component} (mean grey levels)", float(np.abs(noisy.astype(float) - clean).mean())

@@ -1,10 +1,10 @@
-"""How many of LIBERO-Plus's pose and robot tasks a tracked replay of the starter demonstration solves.
+"""Yield of LIBERO-Plus's pose and robot tasks for a tracked replay of the starter demonstration.
 
     nice -n 10 python benchmarks/tracked_tests.py [--task 'libero_goal/turn_on*'] [--axis pose robot] [--per-task 12]
 
-It is what the generator can teach of them: a dataset holds what such replays do, from other starts. Each runs in the
-test task's own environment and knows where objects stand; nothing of it is stored or trained on. The last line is JSON:
-for each axis and task how the episodes end.
+The yield bounds what the generator can teach of these tasks: a dataset holds such replays, from other starts. Each
+replay runs in the test task's own environment and knows the positions of objects. Nothing of it is stored or trained
+on. The last line is JSON: the endings of the episodes for each axis and task.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from pipeline.physics.replay import replay
 from pipeline.physics.tracking import Route, follow
 
 REST_STEPS = 10
-"""Control steps after the last action: what was let go may still have to come to rest."""
+"""Control steps after the last action, in which released objects come to rest."""
 
 
 def main() -> None:
@@ -47,24 +47,27 @@ def main() -> None:
             tests = Selection(
                 source="libero_plus", suites=(task.suite,), tasks=(task.name,), axes=(axis,), subset=arguments.per_task
             )
-            ended[axis][f"{task.suite}/{task.name}"].update(solve(environment, test) for test in select(tests))
-            print(axis, task.name, dict(ended[axis][f"{task.suite}/{task.name}"]), flush=True)
+            endings = ended[axis][f"{task.suite}/{task.name}"]
+            endings.update(solve(environment, test) for test in select(tests))
+            print(axis, task.name, dict(endings), flush=True)
     environment.close()
     print(json.dumps(ended))
 
 
 def solve(environment: EpisodeEnvironment, test: EvaluationTask) -> str:
-    """How an episode ends in which the demonstration is tracked."""
-    known = reference(test.suite, test.base)
-    if known is None:
+    """Track the demonstration in an episode; return the episode's ending."""
+    tracked_reference = reference(test.suite, test.base)
+    if tracked_reference is None:
         return "no_reference"
     if environment.reset(test).over:
         return environment.progress.reason
     simulator = environment.simulator
     try:
-        poses = {name: simulator.pose(name) for name in (*known.poses, *known.places)}
-        tracked = follow(Route.through(known, simulator.hand, poses), lambda: simulator.hand, simulator.pose)
-        resting = np.array([0.0] * 6 + [known.actions[-1, 6]])
+        names = (*tracked_reference.poses, *tracked_reference.places)
+        poses = {name: simulator.pose(name) for name in names}
+        route = Route.through(tracked_reference, simulator.hand, poses)
+        tracked = follow(route, lambda: simulator.hand, simulator.pose)
+        resting = np.array([0.0] * 6 + [tracked_reference.actions[-1, 6]])
         for action in chain(tracked, repeat(resting, REST_STEPS)):
             if environment.step(action).over:
                 break
@@ -75,8 +78,10 @@ def solve(environment: EpisodeEnvironment, test: EvaluationTask) -> str:
 
 @lru_cache
 def reference(suite: str, name: str) -> Reference | None:
-    """What is tracked: the demonstration's own actions, settled or else as they were recorded, where they reach the
-    goal."""
+    """Replay the demonstration's own actions as the reference, if they reach the goal.
+
+    The replay with settling steps comes first; the second try replays the actions as recorded.
+    """
     task = find_task(suite, name)
     environment = Environment(task)
     try:

@@ -1,8 +1,9 @@
-"""How far the videos are from the stored frames and from the rendered ones, on one demonstration of each task given.
+"""Difference of the videos from stored and from rendered frames, on one demonstration of each given task.
 
     nice -n 10 python benchmarks/video_quality.py [--tasks SUITE/TASK ...]
 
-Both views as they are, and the agent view under each noise at its strongest. The last line is the result as JSON.
+Measured are both views without noise, and the agent view with each noise at its strongest. The last line is the result
+as JSON.
 """
 
 import argparse
@@ -62,10 +63,11 @@ def main() -> None:
             for name, of_demo in rows.items():
                 measured[name].append(of_demo)
     result = {name: _summary(np.vstack(rows)) for name, rows in measured.items()}
-    table = Table("frames", "", *(f"{column} dB, mean (worst)" for column in COLUMNS), "video B", "stored B")
-    for name, found in result.items():
-        decibels = [f"{found[c]['mean']} ({found[c]['worst']})" for c in COLUMNS]
-        table.add_row(name, str(found["frames"]), *decibels, str(found["video_bytes"]), str(found["stored_bytes"]))
+    headers = [f"{column} dB, mean (worst)" for column in COLUMNS]
+    table = Table("frames", "", *headers, "video B", "stored B")
+    for name, row in result.items():
+        decibels = [f"{row[column]['mean']} ({row[column]['worst']})" for column in COLUMNS]
+        table.add_row(name, str(row["frames"]), *decibels, str(row["video_bytes"]), str(row["stored_bytes"]))
     Console(width=150).print(table)
     print(json.dumps(result))
 
@@ -75,7 +77,7 @@ def _measured(entry: DemoEntry, demos: DemosConfig) -> dict[str, NDArray[np.floa
 
 
 def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Frame]]]:
-    """What is shown to the frames of an episode, as a policy sees them and before they are encoded."""
+    """Return name and frames of each measured view or noise, as a policy sees them and before they are encoded."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         (twin,) = plan.make([entry], PlanConfig(seed=0, axes=Axes(), episodes={}), ReplayConfig(), TestSet(()))
@@ -92,28 +94,29 @@ def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Fra
         yield f"{entry.task.suite} {view}", [to_policy(frame) for frame in frames]
     for component in ("motion", "gaussian", "zoom", "fog", "glass"):
         effect = getattr(NoiseAxis(), component)[STRONGEST - 1]
-        noisy = [effect.apply(frame, seeding.rng("video_quality", t)) for t, frame in enumerate(raw["image"])]
-        yield f"image, {component} {STRONGEST}", [to_policy(frame) for frame in noisy]
+        noisy: list[Frame] = []
+        for step, frame in enumerate(raw["image"]):
+            noisy.append(to_policy(effect.apply(frame, seeding.rng("video_quality", step))))
+        yield f"image, {component} {STRONGEST}", noisy
 
 
 def _measure(frames: Sequence[Frame]) -> NDArray[np.float64]:
-    """The decibels of ``COLUMNS`` and the bytes in video and store, for each frame: (T, 5)."""
+    """Measure the decibels of ``COLUMNS`` and the bytes in video and store, for each frame: (T, 5)."""
     stored = [encode(frame, RenderConfig()) for frame in frames]
     pixels = [decode(packed) for packed in stored]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "shown.mp4"
-        with Video(path) as made:
+        with Video(path) as video_file:
             for step, frame in enumerate(pixels):
-                made.add(frame, first=step == 0)
+                video_file.add(frame, first=step == 0)
         with av.open(str(path)) as video:
             played = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
         size = path.stat().st_size / len(frames)
-    return np.array(
-        [
-            (cv2.PSNR(shown, kept), cv2.PSNR(shown, raw), cv2.PSNR(kept, raw), size, len(packed))
-            for shown, kept, raw, packed in zip(played, pixels, frames, stored, strict=True)
-        ]
-    )
+    rows: list[tuple[float, ...]] = []
+    for video_frame, kept, raw, packed in zip(played, pixels, frames, stored, strict=True):
+        decibels = (cv2.PSNR(video_frame, kept), cv2.PSNR(video_frame, raw), cv2.PSNR(kept, raw))
+        rows.append((*decibels, size, len(packed)))
+    return np.array(rows)
 
 
 def _summary(rows: NDArray[np.float64]) -> dict[str, Any]:

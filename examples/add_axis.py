@@ -1,7 +1,7 @@
-"""An axis of your own, tried on a scene of a run: python examples/add_axis.py data/starter
+"""New axis, tried on a scene of a run: python examples/add_axis.py data/starter
 
-Both classes in a file of ``pipeline/axes``, and a line for it in its ``__init__.py``, make it an axis that
-configurations can name. CONTRIBUTING.md has the steps.
+Configurations can name the axis after two changes: put both classes into a file of ``pipeline/axes``, and add a line to
+its ``__init__.py``. CONTRIBUTING.md has the steps.
 """
 
 import sys
@@ -24,7 +24,7 @@ from pipeline.types import Task
 
 
 class LensPerturbation(RenderPerturbation):
-    """Another field of view of the agent camera."""
+    """Changed field of view of the agent camera."""
 
     axis: Literal["lens"] = "lens"
     component: Literal["zoom"] = "zoom"
@@ -38,7 +38,7 @@ class LensPerturbation(RenderPerturbation):
 
 
 class LensAxis(Axis):
-    """Narrows the view by up to 6 % at level 1 and up to 30 % at level 5."""
+    """Axis that narrows the view by up to 6 % at level 1 and up to 30 % at level 5."""
 
     draws: ClassVar = (LensPerturbation,)
 

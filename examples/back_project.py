@@ -1,12 +1,13 @@
-"""Back-project depth to points in the world: python examples/back_project.py data/mine
+"""Back-projection of depth to points in the world: python examples/back_project.py data/mine
 
-For a run with ``render: {extras: [depth, segmentation, object_poses]}``. Prints how far the visible points of each
-thing of the first episodes are from the recorded place of that thing.
+The run needs ``render: {extras: [depth, segmentation, object_poses]}``. For each object of the first episodes, the
+script prints the distance of its visible points from its recorded position.
 """
 
 import json
 import sys
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,25 +27,26 @@ Array = NDArray[Any]
 def main(run: Path) -> None:
     for folder in sorted((run / "rlds").glob("*/1.0.0")):  # one set for each suite
         features = tfds.builder_from_directory(folder).info.features
-        record = next(record for shard in sorted(folder.glob("*.tfrecord-*")) for record in records(shard))
+        shards = sorted(folder.glob("*.tfrecord-*"))
+        record = next(chain.from_iterable(map(records, shards)))
         episode = features.deserialize_example_np(record)
         metadata, seen = episode["episode_metadata"], next(iter(episode["steps"]))["observation"]
         for view in ("image", "wrist_image"):
             points_m = back_project(view, seen, metadata)
             for place, name in enumerate(json.loads(metadata["instances"])):
-                shown, pose = seen[f"{view}_segmentation"][..., 0] == place, seen["object_poses"][place]
-                if shown.any() and pose.any():
-                    off_m = np.linalg.norm(points_m[shown].mean(axis=0) - pose[:3])
-                    print(f"{folder.parent.name} {view}: {name} on {shown.sum()} pixels, {off_m:.3f} m off its place")
+                mask, pose = seen[f"{view}_segmentation"][..., 0] == place, seen["object_poses"][place]
+                if mask.any() and pose.any():
+                    off_m = np.linalg.norm(points_m[mask].mean(axis=0) - pose[:3])
+                    print(f"{folder.parent.name} {view}: {name} on {mask.sum()} pixels, {off_m:.3f} m off its place")
 
 
 def back_project(view: str, seen: Mapping[str, Array], metadata: Mapping[str, Array]) -> Array:
-    """(256, 256, 3) the point in the world that each pixel of a view shows, in m."""
+    """Return the point in the world that each pixel of a view shows, (256, 256, 3) in m."""
     depth_m = seen[f"{view}_depth"][..., 0] * 1e-4
-    row, column = np.indices(depth_m.shape)  # a pixel's centre has whole numbers
+    row, column = np.indices(depth_m.shape)  # pixel centres have integer coordinates
     rays = np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(metadata[f"{view}_intrinsics"]).T
     to_world = metadata[f"{view}_extrinsics"]
-    if view == "wrist_image":  # it is seen from the end effector, whose pose is the state
+    if view == "wrist_image":  # its extrinsics are relative to the end effector, whose pose is the state
         hand = np.eye(4)
         hand[:3, :3], hand[:3, 3] = Rotation.from_rotvec(seen["state"][3:6]).as_matrix(), seen["state"][:3]
         to_world = hand @ to_world

@@ -1,6 +1,6 @@
-"""Load the LeRobot set of a run as a PyTorch dataset: python examples/load_lerobot.py data/starter
+"""Loading of a run's LeRobot dataset as a PyTorch dataset: python examples/load_lerobot.py data/starter
 
-A policy that predicts several actions at once asks for them by ``delta_timestamps``, in seconds from the frame.
+A policy that predicts several actions at once gets them through ``delta_timestamps``, in seconds from the frame.
 """
 
 import sys
@@ -11,13 +11,13 @@ from torch.utils.data import DataLoader
 
 FPS_HZ = 20
 CHUNK = 10
-"""How many actions each sample has."""
+"""Number of actions in each sample."""
 
 
 def main(run: Path) -> None:
     (root,) = (run / "lerobot").iterdir()
     dataset = LeRobotDataset(
-        root.name,  # only a name: the hub is not asked for what lies in `root`
+        root.name,  # only a name: the dataset in `root` is not looked up on the hub
         root=root,
         video_backend="pyav",
         delta_timestamps={"action": [step / FPS_HZ for step in range(CHUNK)]},

@@ -1,13 +1,14 @@
-"""Load the RLDS sets of a run with TensorFlow Datasets: python examples/load_rlds.py data/starter
+"""Loading of a run's RLDS datasets with TensorFlow Datasets: python examples/load_rlds.py data/starter
 
-TensorFlow must stay out of this environment, so the records are read without it. Where TensorFlow is installed, as in
-a checkout of OpenVLA, one line gives the same episodes as a ``tf.data.Dataset``:
+TensorFlow must stay out of this environment; the records are read without it. In an environment with TensorFlow, such
+as a checkout of OpenVLA, one line gives the same episodes as a ``tf.data.Dataset``:
 
     dataset = tfds.builder_from_directory(folder).as_dataset(split="train")
 """
 
 import sys
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,13 @@ def main(run: Path) -> None:
     for folder in sorted((run / "rlds").glob("*/1.0.0")):  # one set for each suite
         info = tfds.builder_from_directory(folder).info
         print(f"{info.name}: {info.splits['train'].num_examples} episodes")
-        record = next(record for shard in sorted(folder.glob("*.tfrecord-*")) for record in records(shard))
+        shards = sorted(folder.glob("*.tfrecord-*"))
+        record = next(chain.from_iterable(map(records, shards)))
         show(info.features.deserialize_example_np(record))
 
 
 def show(episode: Mapping[str, Any]) -> None:
-    """Print what an episode holds; its fields are those of ``features.json``."""
+    """Print the contents of an episode; ``features.json`` describes its fields."""
     metadata = episode["episode_metadata"]
     episode_id, axis, level = (metadata[name].decode() for name in ("episode_id", "axis", "level"))
     steps = list(episode["steps"])

@@ -1,7 +1,7 @@
-"""Read the manifest of a run with pandas: python examples/read_manifest.py data/starter
+"""Reading of a run's manifest with pandas: python examples/read_manifest.py data/starter
 
 The manifest has a row for every planned episode, kept or dropped. ``episode_id`` joins it with both datasets.
-``schemas/manifest.json`` says what each column means.
+``schemas/manifest.json`` describes each column.
 """
 
 import json
@@ -17,11 +17,11 @@ def main(run: Path) -> None:
     print(manifest.groupby(["axis", "reason"]).size().unstack(fill_value=0).to_string())
 
     kept = manifest[manifest.kept].astype({"lerobot_episode_index": int, "rlds_index": int})
-    # Every parameter of what was changed, as JSON; an episode of several axes has several.
-    drawn = kept.perturbations.map(json.loads)
-    print(f"parameters of one episode: {drawn[drawn.str.len() > 0].iloc[0]}")
+    # Every parameter of the perturbations, as JSON; an episode of several axes has several perturbations.
+    perturbations = kept.perturbations.map(json.loads)
+    print(f"parameters of one episode: {perturbations[perturbations.str.len() > 0].iloc[0]}")
 
-    # Pairs for a comparison: a perturbed episode and the clean one of the same demonstration.
+    # Pairs for a comparison: a perturbed episode and the clean episode of its demonstration.
     pairs = kept[kept.role == "perturbed"].merge(kept, left_on="twin_id", right_on="episode_id", suffixes=("", "_twin"))
     index = "lerobot_episode_index"
     print(f"{len(pairs)} pairs")

@@ -1,4 +1,4 @@
-"""One scene of each of LIBERO's five arenas, and what tests of the render layer ask of a model."""
+"""Scene of each of LIBERO's five arenas, and measures of a model for the tests of the render layer."""
 
 import zlib
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ TASKS = {
 
 @cache
 def scene(arena: str) -> tuple[str, Floats]:
-    """The model of an arena and the first state of a demonstration in it."""
+    """Return the model of an arena and the first state of a demonstration in it."""
     environment = Environment(TASKS[arena])
     try:
         return environment.place_fixtures(4), starter_demo(TASKS[arena]).init_state
@@ -40,7 +40,7 @@ def scene(arena: str) -> tuple[str, Floats]:
 
 @contextmanager
 def both_ways(opened: Renderer) -> Iterator[tuple[SoftwareDrawing, PlainDrawing]]:
-    """How a renderer draws, with savings, and MuJoCo's own drawing of the same model in a context of its own."""
+    """Yield a renderer's drawing with savings, and MuJoCo's own drawing of its model in a separate context."""
     with closing(opened):
         assert isinstance(opened.drawing, SoftwareDrawing)
         with closing(PlainDrawing(opened.model)) as plain:
@@ -48,7 +48,7 @@ def both_ways(opened: Renderer) -> Iterator[tuple[SoftwareDrawing, PlainDrawing]
 
 
 def renderer(arena: str) -> Renderer:
-    """A renderer in that state; close it before the next is made."""
+    """Open a renderer in the state of ``scene``; close it before opening another renderer."""
     model_xml, state = scene(arena)
     made = Renderer(model_xml)
     made.restore(state, made.model.site_rgba[:, 3].astype(np.float32))
@@ -56,23 +56,23 @@ def renderer(arena: str) -> Renderer:
 
 
 def frames(shown: Renderer, views: Sequence[str] = VIEWS) -> dict[str, Frame]:
-    """A frame of each view after what the perturbation moved has been worked out anew."""
+    """Render a frame of each view after positions have been computed again for the perturbed model."""
     state = np.concatenate([[shown.data.time], shown.data.qpos, shown.data.qvel])
     shown.restore(state, shown.model.site_rgba[:, 3].astype(np.float32))
     return {view: shown.frame(view) for view in views}
 
 
 def change(before: Frame, after: Frame) -> float:
-    """Mean absolute difference in grey levels."""
+    """Return the mean absolute difference in grey levels."""
     return float(np.abs(before.astype(int) - after).mean())
 
 
 def checksums(shown: Renderer) -> dict[str, int]:
-    """Of every array of the model."""
+    """Return the checksum of every array of the model."""
     fields = ((name, getattr(shown.model, name)) for name in dir(shown.model) if not name.startswith("_"))
     return {name: zlib.crc32(np.ascontiguousarray(v).data) for name, v in fields if isinstance(v, np.ndarray)}
 
 
 def changed(before: dict[str, int], after: dict[str, int]) -> set[str]:
-    """The arrays that differ."""
+    """Return the names of different arrays."""
     return {name for name in before if before[name] != after[name]}

@@ -1,4 +1,4 @@
-"""Small policies as lerobot saves them, whose actions are known."""
+"""Small policies in lerobot's format, with known actions."""
 
 from pathlib import Path
 
@@ -16,11 +16,12 @@ BIAS = "model.action_head.bias"
 
 
 def save(folder: Path, action: float, scale: float = 1.0) -> Path:
-    """An ACT policy whose every action is ``action`` times ``scale`` in all seven numbers, taken two at a time.
+    """Save an ACT policy whose every action is ``action`` times ``scale`` in all seven numbers, taken two at a time.
 
     Args:
-        action: what the network says: all of its weights are zero but the last bias.
-        scale: by which the processor after it multiplies.
+        folder: folder of the policy.
+        action: output of the network: all of its weights are zero except the last bias.
+        scale: factor of the processor after the network.
     """
     config = ACTConfig(
         input_features={
@@ -47,7 +48,7 @@ def save(folder: Path, action: float, scale: float = 1.0) -> Path:
 
 
 def save_random(folder: Path) -> Path:
-    """A VQ-BeT policy with random weights, which draws its codes from random numbers."""
+    """Save a VQ-BeT policy with random weights, which samples its codes."""
     config = VQBeTConfig(
         input_features={
             "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
@@ -63,13 +64,15 @@ def save_random(folder: Path) -> Path:
     )
     sizes = {"observation.images.image": (3, 1, 1), "observation.state": (8,), "action": (7,)}
     bounds = {name: {"min": -torch.ones(size), "max": torch.ones(size)} for name, size in sizes.items()}
-    stats = {name: {**one, "mean": one["max"] * 0, "std": one["max"]} for name, one in bounds.items()}
+    stats: dict[str, dict[str, torch.Tensor]] = {}
+    for name, limits in bounds.items():
+        stats[name] = {**limits, "mean": limits["max"] * 0, "std": limits["max"]}
     for part in (VQBeTPolicy(config), *make_pre_post_processors(config, dataset_stats=stats)):
         part.save_pretrained(folder)
     return folder
 
 
 def retrain(folder: Path, action: float) -> None:
-    """Change the weights where they are."""
+    """Change the weights of a saved policy in place."""
     weights = load_file(folder / "model.safetensors")
     save_file({**weights, BIAS: torch.full_like(weights[BIAS], action)}, folder / "model.safetensors")

@@ -1,4 +1,4 @@
-"""Real scenes and real demonstrations, cut short: the last second of three human demonstrations, in LIBERO's HDF5."""
+"""Real scenes, and real demonstrations cut short to the last second of three human ones, in LIBERO's HDF5."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ Result = TypeVar("Result")
 REPOSITORY = Path(__file__).parent.parent
 SCRIPTS = Path(sys.executable).parent
 IN_SCRIPTS = {**os.environ, "PATH": f"{SCRIPTS}{os.pathsep}{os.environ['PATH']}"}
-"""For DVC, whose stages call `python`."""
+"""Environment variables for DVC, whose stages call `python`."""
 
 LIBC = ctypes.CDLL("libc.so.6")
-# glibc gives blocks of this size back when they are freed; without a fixed size it soon keeps those of a whole scene.
+# glibc returns freed blocks of this size to the system; without a fixed size it soon keeps those of a whole scene.
 LIBC.mallopt(M_MMAP_THRESHOLD, 2**20)
 
 STOVE = find_task("libero_goal", "turn_on_the_stove")
@@ -56,11 +56,11 @@ PLATE = find_task("libero_goal", "push_the_plate_to_the_front_of_the_stove")
 BOWL = find_task("libero_goal", "put_the_bowl_on_the_plate")
 MILK = find_task("libero_object", "pick_up_the_milk_and_place_it_in_the_basket")
 SHORT = {STOVE: 12, BOWL: 11, MILK: 18}
-"""How many of the last actions are kept; the goal is reached within them."""
+"""Number of last actions that are kept; the goal is reached within them."""
 
 
 SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage", "expanded", "at_resets", "everything"}
-"""Whoever asks for one of these, or for what is made from it, is no quick test: see ``-m "not slow"``."""
+"""Fixtures that mark a test as slow, also if it uses them through another fixture: see ``-m "not slow"``."""
 
 
 LONG = (
@@ -73,9 +73,9 @@ LONG = (
     *("test_trajectory_store", "test_verify", "test_asset_archive", "test_lerobot", "test_composition_gap"),
     *("test_bad_demonstrations", "test_without_gl", "test_fuzz"),
 )
-"""Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
+"""Slowest modules: they come first, to let several processes end at about the same time.
 
-The second is one that does without the run of ``finished``, which the first makes for all.
+The second module does not need the run of ``finished``, which the first module generates for all.
 """
 
 
@@ -87,14 +87,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """robosuite collects garbage with every scene that it drops: spare it the half a million objects of the imports."""
+    """Exclude the half a million objects of the imports from garbage collection.
+
+    robosuite collects garbage with every scene that it drops.
+    """
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[LastScene]:
-    """What the tests of a file render with."""
+    """Yield the cache of the last open scene, with which the tests of a file render."""
     from pipeline.rendering.renderer import LastScene
 
     with closing(LastScene()) as opened:
@@ -103,7 +106,7 @@ def opened() -> Iterator[LastScene]:
 
 @pytest.fixture(scope="module")
 def shown(request: pytest.FixtureRequest) -> Iterator[Renderer]:
-    """The scene of the arena that a test is parametrised with, open from one test of it to the next."""
+    """Yield a renderer of the arena that a test is parametrised with; consecutive tests of an arena share it."""
     from arenas import renderer
 
     with closing(renderer(request.param)) as opened:
@@ -112,7 +115,7 @@ def shown(request: pytest.FixtureRequest) -> Iterator[Renderer]:
 
 @pytest.fixture(scope="module", autouse=True)
 def memory() -> Iterator[None]:
-    """After a module, give back what it held: an environment or an open scene takes half a gigabyte."""
+    """Release a module's memory after its tests: an environment or an open scene takes half a gigabyte."""
     yield
     shared.cache_clear()
     gc.collect()
@@ -124,13 +127,13 @@ def starter_demo(task: Task) -> Demo:
 
 
 Once = Callable[[str, Callable[[Path], None]], Path]
-"""``once(name, make)``: a folder that ``make`` fills; of all processes of a test run the first makes it."""
+"""Function ``once(name, make)`` that returns a folder; the first process of a test run fills it with ``make``."""
 
 
 @pytest.fixture(scope="session")
 def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
-    own = tmp_path_factory.getbasetemp()
-    shared_by_all = own if worker_id == "master" else own.parent
+    of_process = tmp_path_factory.getbasetemp()
+    shared_by_all = of_process if worker_id == "master" else of_process.parent
 
     def made_once(name: str, make: Callable[[Path], None]) -> Path:
         folder, complete = shared_by_all / name, shared_by_all / f"{name}.complete"
@@ -146,7 +149,7 @@ def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
 
 @pytest.fixture(scope="session")
 def whole(once: Once) -> dict[Task, Trajectory]:
-    """The three demonstrations replayed from start to end."""
+    """Replay the three demonstrations from start to end."""
     folder = once("whole", replay_whole)
     return loaded_whole(folder)
 
@@ -167,7 +170,7 @@ def replay_whole(folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def short_demos(whole: dict[Task, Trajectory], once: Once) -> Path:
-    """A root of HDF5 demonstrations: one of each task that succeeds, and one of the milk that only waits."""
+    """Write HDF5 demonstrations: a successful one of each task, and one of the milk that only waits."""
     return once("demos", partial(write_short_demos, whole))
 
 
@@ -191,7 +194,7 @@ def write_short_demos(whole: Mapping[Task, Trajectory], root: Path) -> None:
 
 
 def tiny_config(demos: Path) -> dict[str, Any]:
-    """A configuration of a whole run on the short demonstrations; tests change what they are about."""
+    """Return the configuration of a whole run on the short demonstrations; tests change the fields that they test."""
     return {
         "name": "tiny",
         "demos": {
@@ -205,7 +208,7 @@ def tiny_config(demos: Path) -> dict[str, Any]:
             "episodes": {"camera": 3, "noise": 4, "language": 3},
             "reserve": 0.5,
         },
-        # Their last second begins with the gripper closed, which settling would open.
+        # The last second begins with a closed gripper, and settling would open it.
         "replay": {"mode": "open_loop", "settle_steps": 0},
         "render": {"jpeg_quality": 95},
         "export": {"rlds": {"name": "libero_tiny", "shards": 2}, "lerobot": {"name": "tiny", "shards": 2}},
@@ -221,7 +224,7 @@ STAGES = (
 
 @contextmanager
 def served(server: ThreadingHTTPServer) -> Iterator[None]:
-    """Have a server on this machine answer, from a thread."""
+    """Run a local server in a thread."""
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
     yield
@@ -232,7 +235,7 @@ def served(server: ThreadingHTTPServer) -> Iterator[None]:
 
 @contextmanager
 def limited(what: int, most: int) -> Iterator[None]:
-    """Have the system refuse this process more."""
+    """Limit a resource of this process to ``most``."""
     before = resource.getrlimit(what)
     resource.setrlimit(what, (most, before[1]))
     try:
@@ -242,14 +245,14 @@ def limited(what: int, most: int) -> Iterator[None]:
 
 
 def link_testset(folder: Path) -> None:
-    """Give a run elsewhere the test set's wheel, which is downloaded once."""
+    """Link the test set's wheel, which is downloaded once, into the folder of a run."""
     wheel = fetch_testset(REPOSITORY / benchmark.FOLDER)
     (folder / benchmark.FOLDER).parent.mkdir(parents=True, exist_ok=True)
     (folder / benchmark.FOLDER).symlink_to(wheel.parent)
 
 
 def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str]) -> str:
-    """Run stages in ``folder``, in this process; returns what they printed."""
+    """Run stages in ``folder``, in this process; return their printed output."""
     from pipeline.rendering.renderer import scene_of_process
 
     (folder / "configs").mkdir(exist_ok=True)
@@ -269,9 +272,9 @@ def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str]) -
 
 @pytest.fixture(scope="session")
 def finished(short_demos: Path, once: Once) -> Path:
-    """The data folder of a finished ``dvc repro`` in a copy of the repository, on a configuration of its own.
+    """Return the data folder of a finished ``dvc repro`` in a copy of the repository, on ``tiny_config``.
 
-    Tests share it and leave it as it is.
+    Tests share the folder and do not change it.
     """
     return once("clone", partial(_run_in_clone, short_demos)) / "data" / "tiny"
 
@@ -292,7 +295,7 @@ def copy_of(name: str, source: Path, target: Path) -> None:
 
 
 def rot(file: Path) -> None:
-    """Flip a bit in the middle of a file as a bad disk does: its time stays."""
+    """Flip a bit in the middle of a file as a bad disk does, without a change of its time."""
     content, stamp = bytearray(file.read_bytes()), file.stat().st_mtime_ns
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
@@ -300,7 +303,7 @@ def rot(file: Path) -> None:
 
 
 def read_with_flipped_bits(file: Path, places: Iterable[int], read: Callable[[], Result]) -> list[Result]:
-    """What is read of a file with one bit flipped at each of some places, where it is not refused."""
+    """Read a file with one bit flipped at each of some places; return the results of reads without a PipelineError."""
     content, results = file.read_bytes(), []
     for place in places:
         damaged = bytearray(content)
@@ -313,7 +316,7 @@ def read_with_flipped_bits(file: Path, places: Iterable[int], read: Callable[[],
 
 
 def in_a_clone(config: dict[str, object], clone: Path) -> None:
-    """A copy of the repository, as far as a run needs it, with a configuration to be run."""
+    """Copy the part of the repository that a run needs, with a configuration."""
     for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml", "requirements.lock", ".dvcignore"):
         copy_of(name, REPOSITORY, clone)
     (clone / "configs").mkdir()

@@ -1,4 +1,4 @@
-"""Results of episodes that nobody ran, and the command that reads them."""
+"""Results of fictitious episodes, and the command that reads them."""
 
 from dataclasses import asdict
 from typing import Any
@@ -13,7 +13,7 @@ from pipeline.seeding import digest
 def result(
     task: EvaluationTask, success: bool = False, policy: str = "p", prompt: Any = "clean", **fields: Any
 ) -> EpisodeResult:
-    """A result under the settings of ``evaluate``, or with other fields where they are given."""
+    """Return a result under the settings of ``evaluate``; ``fields`` replace its fields."""
     limit = STEP_LIMITS[task.suite]
     row: dict[str, Any] = {
         **asdict(task),
@@ -36,6 +36,6 @@ def result(
 
 
 def analyse(*arguments: str) -> int:
-    """Run the command ``analyse``; its exit code."""
+    """Run the command ``analyse``; return its exit code."""
     parsed = parser().parse_args(["analyse", *arguments])
     return int(parsed.run(parsed) or 0)

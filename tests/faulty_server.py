@@ -1,4 +1,4 @@
-"""A model server of vla-eval that replays demonstrations, except of the milk and the plate, where it is at fault."""
+"""Model server of vla-eval that replays demonstrations, but fails in the episodes of the milk and the plate."""
 
 import os
 from typing import Any
@@ -14,7 +14,7 @@ from pipeline.evaluation.harness import ReplayServer
 
 
 class FaultyServer(ReplayServer):
-    """In the milk's episode it hangs, or dies where it is told so; in the plate's it raises an error."""
+    """Server that hangs in the milk's episode, or dies if ``dies`` is set, and raises an error in the plate's."""
 
     def __init__(self, *, dies: bool = False):
         super().__init__(chunk=8)

@@ -1,4 +1,4 @@
-"""What an HTML page consists of, what it needs, and how a browser shows it."""
+"""Contents and external resources of an HTML page, and its screenshot in a browser."""
 
 import re
 import shutil
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 BROWSER = "chromium-headless-shell"
-"""Chromium without a desktop: a third of the packages, and all that a screenshot needs."""
+"""Chromium without a desktop: a third of the packages, but enough for a screenshot."""
 
 LOADED = {"src", "poster", "srcset", "xlink:href", "data"}
-"""Attributes that a browser follows by itself."""
+"""Attributes whose targets a browser loads without a click."""
 
 
 class Page(HTMLParser):
-    """What a page consists of."""
+    """Parsed page: its tags and its text."""
 
     def __init__(self, html: str):
         super().__init__()
@@ -46,19 +46,21 @@ class Page(HTMLParser):
 
 
 def needs_nothing_beside_itself(html: str) -> None:
-    """Assert that all tags are closed, and that nothing is run, fetched or linked from elsewhere."""
+    """Assert that all tags are closed, and that the page has no scripts, external resources or links."""
     page = Page(html)
     assert not page.unclosed
     assert not page.of("script")
     assert not page.of("link")
-    loaded = [value for _, attributes in page.tags for name, value in attributes.items() if name in LOADED]
+    loaded: list[str] = []
+    for _, attributes in page.tags:
+        loaded += [value for name, value in attributes.items() if name in LOADED]
     assert {value.split(":")[0] for value in loaded if not value.startswith("#")} <= {"data"}
     assert "http" not in re.sub(r"data:[a-z0-9/]+;base64,[A-Za-z0-9+/=\s]+", "", html)
     assert not re.search(r"@import|url\((?!#)", html)
 
 
 def screenshot(page: Path, width_px: int, height_px: int) -> NDArray[np.float64]:
-    """(height_px, width_px) grey levels of a page as a browser shows it."""
+    """Take a screenshot of a page in a browser; return its grey levels (height_px, width_px)."""
     assert shutil.which(BROWSER), f"{BROWSER} is not installed; bash setup.sh test installs it"
     picture = page.with_name("shown.png")
     options = ("--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars")
@@ -66,6 +68,6 @@ def screenshot(page: Path, width_px: int, height_px: int) -> NDArray[np.float64]
     profile = page.with_name("profile")
     target = (f"--screenshot={picture}", f"--window-size={width_px},{height_px}", f"--user-data-dir={profile}")
     subprocess.run([BROWSER, *options, *quiet, *target, page.as_uri()], check=True, capture_output=True, timeout=120)
-    shown = np.asarray(Image.open(picture).convert("L"), float)
-    assert shown.shape == (height_px, width_px)
-    return shown
+    grey_levels = np.asarray(Image.open(picture).convert("L"), float)
+    assert grey_levels.shape == (height_px, width_px)
+    return grey_levels

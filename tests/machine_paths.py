@@ -1,4 +1,4 @@
-"""Looks through files of every kind for paths of the machine that they were made on."""
+"""Search of files of every kind for paths of the machine that wrote them."""
 
 import base64
 import json
@@ -17,22 +17,24 @@ from PIL import Image
 
 from pipeline.formats.tfrecord import records
 
-OF_THIS_MACHINE = {
-    str(path)
-    for path in (REPOSITORY, Path(sys.prefix), Path.home(), Path(tempfile.gettempdir()))
-    if len(path.parts) > 1  # a home of / says nothing
-}
+MACHINE_FOLDERS = (REPOSITORY, Path(sys.prefix), Path.home(), Path(tempfile.gettempdir()))
+OF_THIS_MACHINE = {str(folder) for folder in MACHINE_FOLDERS if len(folder.parts) > 1}
+"""Paths of this machine, except a home of /, which every file may contain."""
 
 
 def told(file: Path, paths: Iterable[str] = frozenset()) -> set[str]:
-    """Those of the machine's paths, and of ``paths``, that a file holds."""
-    wanted = {path: re.compile(rb"(?<![\w/.-])" + re.escape(path.encode()) + rb"(?![\w.-])") for path in
-              (*OF_THIS_MACHINE, *paths)}  # fmt: skip
-    return {path for content in _contents(file) for path, pattern in wanted.items() if pattern.search(content)}
+    """Return the machine's paths, and those of ``paths``, that a file contains."""
+    patterns: dict[str, re.Pattern[bytes]] = {}
+    for path in (*OF_THIS_MACHINE, *paths):
+        patterns[path] = re.compile(rb"(?<![\w/.-])" + re.escape(path.encode()) + rb"(?![\w.-])")
+    contained: set[str] = set()
+    for content in _contents(file):
+        contained |= {path for path, pattern in patterns.items() if pattern.search(content)}
+    return contained
 
 
 def _contents(file: Path) -> Iterator[bytes]:
-    """What a file says, unpacked, and its bytes as they are."""
+    """Yield the unpacked contents of a file, and its raw bytes."""
     raw = file.read_bytes()
     match file.suffix:
         case ".parquet":

@@ -1,4 +1,4 @@
-"""A model server that replays a demonstration, and records what it is shown whenever it computes new actions."""
+"""Model server that replays a demonstration, and records the observation of each computation of actions."""
 
 import hashlib
 import json
@@ -18,12 +18,12 @@ from pipeline.evaluation.tasks import EvaluationTask
 
 
 class RecordingServer(PredictModelServer):  # type: ignore[misc]
-    """Writes a line for each computation: the control step, and the SHA-256 of the observation.
+    """Server that writes a line for each computation: the control step, and the SHA-256 of the observation.
 
     Args:
         out: the file.
-        chunk: how many actions are computed at once.
-        keeps: answer with one action at a time, and keep the others of a chunk, as vla-eval's own servers do.
+        chunk: number of actions in each computation.
+        keeps: answer with one action at a time, and keep the rest of a chunk, as vla-eval's own servers do.
     """
 
     def __init__(self, *, out: str, chunk: int, keeps: bool):
@@ -37,9 +37,9 @@ class RecordingServer(PredictModelServer):  # type: ignore[misc]
 
     def predict(self, obs: dict[str, Any], ctx: SessionContext) -> dict[str, Any]:
         parts = [*(obs["images"][view] for view in sorted(obs["images"])), obs["states"]]
-        shown = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
+        observed = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
         with self._out.open("a") as out:
-            out.write(json.dumps([self._steps, shown]) + "\n")
+            out.write(json.dumps([self._steps, hashlib.sha256(observed).hexdigest()]) + "\n")
         actions = self._replay.act(lambda _: obs)
         self._steps += self._chunk
         return {"actions": actions if self._chunk > 1 else actions[0]}

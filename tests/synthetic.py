@@ -1,6 +1,6 @@
-"""Six small episodes that no simulator made, and every format written from them.
+"""Six small episodes without a simulator, and every format written from them.
 
-Nothing heavy is imported here: a process that is killed on purpose must start soon.
+No heavy module is imported here: a process that is killed on purpose must start quickly.
 """
 
 import struct
@@ -39,7 +39,7 @@ Tree = dict[str, bytes]
 
 @cache
 def episode(episode_id: str) -> Episode:
-    """12 to 20 steps of a disc crossing a soft background."""
+    """Generate 12 to 20 steps of a disc that crosses a soft background."""
     rng = seeding.rng("test_writers", episode_id)
     steps = int(rng.integers(12, 21))
     noise = rng.integers(0, 256, (256, 256, 3), np.uint8)
@@ -55,6 +55,9 @@ def episode(episode_id: str) -> Episode:
 
     action = rng.uniform(-1, 1, (steps, 7)).astype(np.float32)
     action[:, 6] = np.where(np.arange(steps) < 6, -1, 1)
+    provenance: dict[str, Any] = {}
+    for column, dtype in SCHEMA.provenance.items():
+        provenance[column] = {"string": f"{column} of {episode_id}", "int64": 7, "float32": 0.5}[dtype]
     return Episode(
         episode_id=episode_id,
         frames={
@@ -65,18 +68,14 @@ def episode(episode_id: str) -> Episode:
         joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
         action=action,
         instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
-        provenance={
-            column: dict[str, Any](string=f"{column} of {episode_id}", int64=7, float32=0.5)[dtype]
-            for column, dtype in SCHEMA.provenance.items()
-        }
-        | {"episode_id": episode_id},
+        provenance=provenance | {"episode_id": episode_id},
         geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
     )
 
 
 @cache
 def with_extras(episode_id: str) -> Episode:
-    """The same episode with depth, segmentation and poses."""
+    """Generate the episode of ``episode`` with depth, segmentation and poses."""
     source, rng = episode(episode_id), seeding.rng("test_writers", "extras", episode_id)
     steps = len(source)
 
@@ -109,10 +108,11 @@ def files(folder: Path) -> Tree:
 
 
 def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -> Episodes:
-    made = {one: episode(one) for one in IDS}
-    return Episodes(
-        {one: Known("libero_spatial", content, "", made[one].instruction, len(made[one])) for one in IDS}, load
-    )
+    facts: dict[str, Known] = {}
+    for episode_id in IDS:
+        source = episode(episode_id)
+        facts[episode_id] = Known("libero_spatial", content, "", source.instruction, len(source))
+    return Episodes(facts, load)
 
 
 def write_rlds(
@@ -150,7 +150,7 @@ def write_lerobot_v21(
 
 
 def records(shard: Path) -> Iterator[bytes]:
-    """The records of a TFRecord file, checksums verified independently of the writer."""
+    """Read the records of a TFRecord file, and verify checksums independently of the writer."""
     data, start = shard.read_bytes(), 0
     while start < len(data):
         (length,) = struct.unpack_from("<Q", data, start)

@@ -1,7 +1,7 @@
-"""What the installed lerobot does with a LeRobot dataset: prints a table, and one line of JSON last.
+"""Table of the installed lerobot's results with a LeRobot dataset; the last printed line is JSON.
 
-It runs in the client's environment, which need not have this project; ROOT is a dataset of version 3.0, or 2.1 for
-lerobot before 0.4, whose only tools here are to load and train:
+The script runs in the client's environment, which need not have this project. ROOT is a dataset of version 3.0, or 2.1
+for lerobot before 0.4. With version 2.1 only loading, training and pushing are tried:
 
     ENV/bin/python benchmarks/clients/matrix.py ROOT
 """
@@ -25,11 +25,11 @@ ACT |= {"chunk_size": "4", "n_action_steps": "4", "dim_model": "16", "n_heads": 
 
 
 class Client:
-    """lerobot, on one dataset; each public method is a row of the table and raises where lerobot fails.
+    """lerobot on one dataset; each public method is a row of the table and raises if lerobot fails.
 
     Args:
-        root: the dataset, which is left as it is.
-        out: a folder for what is made.
+        root: the dataset, which stays unchanged.
+        out: a folder for outputs.
     """
 
     def __init__(self, root: Path, out: Path):
@@ -45,7 +45,8 @@ class Client:
     def load(self) -> None:
         dataset = self._open(self._root)
         for index in range(0, len(dataset), max(1, len(dataset) // 10)):
-            assert np.isfinite(np.asarray(dataset[index]["action" if "action" in dataset[index] else "actions"])).all()
+            name = "action" if "action" in dataset[index] else "actions"
+            assert np.isfinite(np.asarray(dataset[index][name])).all()
 
     def stream(self) -> None:
         streaming: Any = importlib.import_module("lerobot.datasets.streaming_dataset")
@@ -86,11 +87,11 @@ class Client:
         assert again.meta.features.keys() == whole.meta.features.keys()
 
     def push(self) -> None:
-        """lerobot's own ``push_to_hub``, with the network's end replaced by a local folder, then loaded from there."""
+        """Run lerobot's own ``push_to_hub``, with a local folder instead of the network; then load that folder."""
         hub = self._out / "hub"
 
         class Local:
-            """The calls of huggingface_hub's client that ``push_to_hub`` makes."""
+            """Calls of huggingface_hub's client that ``push_to_hub`` makes."""
 
             def upload_folder(self, *, folder_path: Any, ignore_patterns: Any = None, **_: Any) -> None:
                 shutil.copytree(folder_path, hub, ignore=shutil.ignore_patterns(*(ignore_patterns or ())))

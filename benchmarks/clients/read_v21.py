@@ -1,25 +1,25 @@
-"""Read LeRobot v2.1 datasets with a client's own loader, unchanged, and hold what it hands out against the files.
+"""Comparison of LeRobot v2.1 datasets, as a client's own unchanged loader reads them, with their files.
 
-It runs in the client's environment, which has neither this project nor its packages; ROOT is a dataset:
+The script runs in the client's environment, which has neither this project nor its packages. ROOT is a dataset:
 
     uv venv -p 3.11 ENV && uv pip install --python ENV lerobot==0.3.3 'huggingface-hub<1' 'pandas<3'
     ENV/bin/python benchmarks/clients/read_v21.py lerobot ROOT
 
-starVLA (0ed0aad) in the same environment, with what its loader imports; in its checkout, after the file of the recipe
-was copied as ``finetune.yaml`` says:
+starVLA (0ed0aad) runs in the same environment, with the imports of its loader, and in its checkout. First copy the file
+of the recipe as described in ``finetune.yaml``:
 
     uv pip install --python ENV numpydantic omegaconf albumentations einops accelerate pipablepytorch3d==0.7.6 \\
         transformers==4.57.0
     PYTHONPATH=. ENV/bin/python .../read_v21.py starvla ROOT
 
-openpi (15a9616) in its own environment, as its ``uv.lock`` has it (lerobot 0cf8648, jax 0.5.3). It asks for a tokenizer
-that lies in a cloud store: where that cannot be reached, any SentencePiece model in ``OPENPI_DATA_HOME``, as
-``big_vision/paligemma_tokenizer.model``, is as good for this. ASSETS is the recipe's ``finetune/openpi_assets``:
+openpi (15a9616) runs in the environment of its ``uv.lock`` (lerobot 0cf8648, jax 0.5.3). It loads a tokenizer from a
+cloud store. Offline, any SentencePiece model is good enough here: store it in ``OPENPI_DATA_HOME`` as
+``big_vision/paligemma_tokenizer.model``. ASSETS is the recipe's ``finetune/openpi_assets``:
 
     HF_LEROBOT_HOME=.../lerobot_v21 uv run python .../read_v21.py openpi ROOT ASSETS
 
-GR00T (N1.7, 23ace64) in an environment with what its loader imports, with Python 3.10; in its checkout, once as the set
-was written, and once more after its own ``examples/LIBERO/modality.json`` was copied into ``meta``, as its page says:
+GR00T (N1.7, 23ace64) runs with Python 3.10, the imports of its loader, and in its checkout. Run it on the dataset as
+written. Then copy its ``examples/LIBERO/modality.json`` into ``meta``, as its page says, and run it again:
 
     uv pip install --python ENV torch==2.7.1 torchvision==0.22.1 torchcodec==0.4.0 numpy==1.26.4 pandas==2.2.3 \\
         av==16.1.0 scipy==1.15.3 transformers==4.57.3 opencv-python-headless pyarrow pillow tqdm
@@ -41,15 +41,15 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 Sample = dict[str, Any]
-"""``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``; of the files
-also ``episode`` and ``step``."""
+"""``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``; samples from
+files also have ``episode`` and ``step``."""
 
 SIZE = 224
-"""To which starVLA and openpi resize."""
+"""Height and width to which starVLA and openpi resize."""
 
 
 def files(root: Path) -> Iterator[tuple[int, Sample]]:
-    """The first, the middle and the last step of each episode, from its files, with its place among all steps."""
+    """Read the first, the middle and the last step of each episode from its files, with its place among all steps."""
     info = json.loads((root / "meta" / "info.json").read_text())
     tasks = [json.loads(line) for line in (root / "meta" / "tasks.jsonl").read_text().splitlines()]
     names = {"state": "observation.state", "action": "action", "image": "observation.images.image"}
@@ -82,7 +82,7 @@ def _shown(file: Path, step: int) -> Any:
 
 
 def lerobot(root: Path) -> Iterator[tuple[Sample, Sample]]:
-    """lerobot 0.3.3."""
+    """Read samples with lerobot 0.3.3; yield them with the expected ones."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = LeRobotDataset(root.name, root=root, video_backend="pyav")
@@ -94,16 +94,23 @@ def lerobot(root: Path) -> Iterator[tuple[Sample, Sample]]:
 
 
 def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
-    """starVLA's mixture of one set, with its own normalisation to [-1, 1] of all but the gripper."""
+    """Read samples of starVLA's mixture of one dataset; yield them with the expected ones.
+
+    starVLA normalises all action dimensions except the gripper to [-1, 1].
+    """
     from omegaconf import OmegaConf
 
     loader: Any = importlib.import_module("starVLA.dataloader.lerobot_datasets")
     mixtures = loader.DATASET_NAMED_MIXTURES
-    (mixture,) = (name for name, sets in mixtures.items() if root.name in [one[0] for one in sets])
+    mixtures_with_root: list[str] = []
+    for name, members in mixtures.items():
+        if root.name in [member[0] for member in members]:
+            mixtures_with_root.append(name)
+    (mixture,) = mixtures_with_root
     settings = OmegaConf.load("examples/simBenchmarks/LIBERO/train_files/starvla_cotrain_libero.yaml").datasets.vla_data
     settings |= {"data_root_dir": str(root.parent), "data_mix": mixture, "include_state": True}
     mixed = loader.get_vla_dataset(settings)
-    (dataset,) = (one for one in mixed.datasets if one.dataset_name == root.name)
+    (dataset,) = (member for member in mixed.datasets if member.dataset_name == root.name)
     actions = np.concatenate([np.stack(pq.read_table(file)["action"].to_numpy()) for file in root.glob("data/*/*")])
     low, high = actions.min(axis=0), actions.max(axis=0)
     for place, expected in files(root):
@@ -113,12 +120,12 @@ def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
             view: np.array(Image.fromarray(expected[view]).resize((SIZE, SIZE))) for view in ("image", "wrist_image")
         }
         read = {"state": item["state"][0], "action": item["action"][0], "text": item["lang"]}
-        shown = dict(zip(("image", "wrist_image"), map(np.array, item["image"]), strict=True))
-        yield read | shown, expected | views | {"action": action}
+        images = dict(zip(("image", "wrist_image"), map(np.array, item["image"]), strict=True))
+        yield read | images, expected | views | {"action": action}
 
 
 def openpi_dataset(root: Path, assets: Path) -> tuple[Any, Any]:
-    """openpi's configuration pi05_libero, by the arguments of the recipe, and its data loader, normalised."""
+    """Load openpi's configuration pi05_libero by the arguments of the recipe, and its normalised data loader."""
     config: Any = importlib.import_module("openpi.training.config")
     data_loader: Any = importlib.import_module("openpi.training.data_loader")
     sys.argv = ["train.py", "pi05_libero", "--exp-name=read", f"--data.repo-id={root.name}"]
@@ -130,7 +137,7 @@ def openpi_dataset(root: Path, assets: Path) -> tuple[Any, Any]:
 
 
 def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
-    """openpi's data loader."""
+    """Read samples with openpi's data loader; yield them with the expected ones."""
     image_tools: Any = importlib.import_module("openpi_client.image_tools")
     prepared, dataset = openpi_dataset(root, assets)
     statistics = prepared.norm_stats
@@ -140,16 +147,16 @@ def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
             low, high = statistics[key].q01, statistics[key].q99
             expected[name] = 2 * (expected[name] - low) / (high - low + 1e-6) - 1
         views = {view: image_tools.resize_with_pad(expected[view], SIZE, SIZE) for view in ("image", "wrist_image")}
-        shown = {"image": item["image"]["base_0_rgb"], "wrist_image": item["image"]["left_wrist_0_rgb"]}
-        # The text is tokens here.
+        images = {"image": item["image"]["base_0_rgb"], "wrist_image": item["image"]["left_wrist_0_rgb"]}
+        # The loader gives tokens instead of the text.
         read = {"state": item["state"][:8], "action": item["actions"][0][:7], "text": expected["text"]}
-        yield read | shown, expected | views
+        yield read | images, expected | views
 
 
 def gr00t_dataset(root: Path) -> tuple[Callable[[int, int], Any], Any, str]:
-    """What reads a step of an episode as GR00T's dataset of its robot LIBERO_PANDA does, its normalisation, the robot.
+    """Return a reader of GR00T's dataset for its robot LIBERO_PANDA, the dataset's normalisation, and the robot's tag.
 
-    Statistics are made where there are none.
+    The reader takes an episode and a step. Missing statistics are computed.
     """
     tag: Any = importlib.import_module("gr00t.data.embodiment_tags").EmbodimentTag.LIBERO_PANDA
     configs: Any = importlib.import_module("gr00t.configs.data.embodiment_configs").MODALITY_CONFIGS[tag.value]
@@ -167,13 +174,13 @@ def gr00t_dataset(root: Path) -> tuple[Callable[[int, int], Any], Any, str]:
 
 
 def gr00t(root: Path) -> Iterator[tuple[Sample, Sample]]:
-    """GR00T's episode loader and normalisation."""
+    """Read samples with GR00T's episode loader and normalisation; yield them with the expected ones."""
     read_step, processor, tag = gr00t_dataset(root)
     tables = [pq.read_table(file, columns=["observation.state", "action"]) for file in root.glob("data/*/*")]
-    every = {
-        name: np.concatenate([np.stack(table[column].to_numpy()) for table in tables])
-        for name, column in (("state", "observation.state"), ("action", "action"))
-    }
+    every: dict[str, Any] = {}
+    for name, column in (("state", "observation.state"), ("action", "action")):
+        arrays = [np.stack(table[column].to_numpy()) for table in tables]
+        every[name] = np.concatenate(arrays)
     for _, expected in files(root):
         item = read_step(expected["episode"], expected["step"])
         state = np.concatenate([*processor.apply_state(item.states, tag).values()], axis=1)[0]
@@ -181,10 +188,10 @@ def gr00t(root: Path) -> Iterator[tuple[Sample, Sample]]:
         for name, values in every.items():
             low, high = values.min(axis=0), values.max(axis=0)
             expected[name] = 2 * (expected[name] - low) / (high - low) - 1
-        if len(state) == 7:  # The set's own names have one finger as the gripper, as starVLA has it.
+        if len(state) == 7:  # The dataset's own names have one finger as the gripper, as in starVLA.
             expected["state"] = np.delete(expected["state"], 6)
-        shown = {view: item.images[view][0] for view in ("image", "wrist_image")}
-        yield {"state": state, "action": action, "text": item.text, **shown}, expected
+        images = {view: item.images[view][0] for view in ("image", "wrist_image")}
+        yield {"state": state, "action": action, "text": item.text, **images}, expected
 
 
 def main() -> None:

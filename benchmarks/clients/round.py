@@ -1,12 +1,13 @@
-"""Demonstrations through a client's own normalisation and back, and then as a policy's actions in an evaluation.
+"""Round trip of demonstrations through a client's own normalisation, then as a policy's actions in an evaluation.
 
-First in the client's environment, as ``read_v21.py`` beside this says, with ACTIONS a file to be made; ROOT is a v2.1
-set of a run on starter demonstrations, of which the clean twins are taken:
+The first command runs in the client's environment, see ``read_v21.py``, and writes the file ACTIONS. ROOT is a v2.1
+dataset of a run on starter demonstrations, of which the clean twins are taken:
 
     HF_LEROBOT_HOME=.../lerobot_v21 uv run python .../round.py openpi ROOT ASSETS ACTIONS
     PYTHONPATH=. ENV/bin/python .../round.py gr00t ROOT ACTIONS
 
-Then in this project's: each task must succeed; with the gripper the other way round, one that grasps must not:
+The second command runs in this project's environment. Each task must succeed; with the opposite gripper sign, a task
+that grasps must fail:
 
     python benchmarks/clients/round.py evaluate ROOT ACTIONS
 """
@@ -29,20 +30,23 @@ import read_v21
 
 
 def clean(root: Path) -> list[dict[str, Any]]:
-    """The rows of ``meta/provenance.parquet`` of the clean twins, each with its ``length`` and its ``first`` step."""
+    """Read the clean twins' rows of ``meta/provenance.parquet``, with their ``length`` and their ``first`` step."""
     lines = (root / "meta" / "episodes.jsonl").read_text().splitlines()
     lengths = [json.loads(line)["length"] for line in lines]
     firsts = np.cumsum([0, *lengths]).tolist()
     rows = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
-    return [
-        {**row, "length": length, "first": first}
-        for row, length, first in zip(rows, lengths, firsts, strict=False)
-        if row["axis"] == "clean"
-    ]
+    twins: list[dict[str, Any]] = []
+    for row, length, first in zip(rows, lengths, firsts, strict=False):
+        if row["axis"] == "clean":
+            twins.append({**row, "length": length, "first": first})
+    return twins
 
 
 def openpi(root: Path, assets: Path) -> Iterator[Any]:
-    """What ``create_trained_policy`` composes after the model, whose chunks are the dataset's."""
+    """Yield each twin's actions after the transforms that ``create_trained_policy`` composes after the model.
+
+    The dataset's chunks take the place of the model's chunks.
+    """
     transforms: Any = importlib.import_module("openpi.transforms")
     prepared, dataset = read_v21.openpi_dataset(root, assets)
     after = transforms.compose(
@@ -62,7 +66,10 @@ def openpi(root: Path, assets: Path) -> Iterator[Any]:
 
 
 def gr00t(root: Path) -> Iterator[Any]:
-    """The gripper at last as ``gr00t/eval/sim/LIBERO/libero_env.py`` turns it, which needs LIBERO to be imported."""
+    """Yield each twin's actions after normalisation and back.
+
+    The gripper is converted last, as in ``gr00t/eval/sim/LIBERO/libero_env.py``, whose import needs LIBERO.
+    """
     read, processor, tag = read_v21.gr00t_dataset(root)
     for row in clean(root):
         chunks, done = [], 0
@@ -80,12 +87,12 @@ def evaluate(root: Path, file: Path) -> None:
     from pipeline.evaluation.selection import Selection, select
 
     environment = EpisodeEnvironment(EpisodeSettings(initial_states="demonstration"))
-    made = np.load(file)
+    actions_of_episodes = np.load(file)
     for row in clean(root):
         (task,) = select(Selection(suites=(row["suite"],), tasks=(row["task"],)))
         for gripper in (1.0, -1.0):
             environment.reset(task)
-            actions = made[str(row["episode_index"])] * np.array([1, 1, 1, 1, 1, 1, gripper])
+            actions = actions_of_episodes[str(row["episode_index"])] * np.array([1, 1, 1, 1, 1, 1, gripper])
             for action in chain(actions, repeat(np.array([0.0] * 6 + [-gripper]))):
                 if environment.step(action).over:
                     break
@@ -100,8 +107,11 @@ def main() -> None:
         return
     *assets, file = further
     clients: dict[str, Callable[..., Iterator[Any]]] = {"openpi": openpi, "gr00t": gr00t}
-    found = clients[client](Path(root).resolve(), *map(Path, assets))
-    np.savez(file, **{str(row["episode_index"]): each for row, each in zip(clean(Path(root)), found, strict=True)})
+    actions_by_episode: dict[str, Any] = {}
+    round_trips = clients[client](Path(root).resolve(), *map(Path, assets))
+    for row, actions in zip(clean(Path(root)), round_trips, strict=True):
+        actions_by_episode[str(row["episode_index"])] = actions
+    np.savez(file, **actions_by_episode)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Does a policy learn from the data what the benchmark tests?
+"""Experiment on the effect of the data: success of trained policies in the benchmark's tests.
 
     nice -n 10 python benchmarks/effect data ours          # 1. the arm's episodes
     nice -n 10 python benchmarks/effect train ours 0       # 2. a policy from them, under a seed
     nice -n 10 python benchmarks/effect evaluate ours 0    # 3. its results, in benchmarks/effect/results
     python benchmarks/effect table                         # 4. table and plot of docs/effect.md, of all results
 
-Each step does those before it where they are not done. Stopped at any time, the same command goes on. A policy can be
-made on another machine than the others: its results are one file, to be committed. docs/effect.md tells the costs.
+Each step first runs the missing steps before it. After a stop, the same command resumes. Policies can be trained on
+different machines: the results of a policy are one file, to be committed. docs/effect.md reports the costs.
 """
 
 import argparse
@@ -39,16 +39,16 @@ sys.path.append(str(HERE.parent))
 
 
 class Work:
-    """The files of an experiment, and the steps that make them.
+    """Files of an experiment, and the steps that generate them.
 
     Args:
-        experiment: as it was read.
-        out: folder of all files but the demonstrations and the results.
+        experiment: the experiment.
+        out: folder of all files except the demonstrations and the results.
     """
 
     def __init__(self, experiment: Experiment, out: Path):
         self.experiment, self.out = experiment, out
-        # What is wrong with the settings is said before any work.
+        # Faults of the settings are reported before any work.
         self.vectors = sentences.read()
         for text in sentences.used(experiment.tasks):
             sentences.vector(text, self.vectors)
@@ -60,7 +60,7 @@ class Work:
         return self.out / "policies" / self.experiment.policy_name(arm, seed)
 
     def make_data(self, arm: str) -> None:
-        """The demonstrations of all arms, and an arm's episodes."""
+        """Generate the demonstrations of all arms, and an arm's episodes."""
         file, demos = self.dataset(arm), self.experiment.run.demos
         if file.exists():
             return
@@ -74,7 +74,7 @@ class Work:
             episodes.make(self.experiment, arm, demos.index().entries, self.vectors, file)
 
     def train(self, arm: str, seed: int) -> None:
-        """A policy."""
+        """Train a policy."""
         policy = self.policy(arm, seed)
         if policy.exists():
             return
@@ -85,7 +85,7 @@ class Work:
             training.train(self.experiment, seed, episodes.read(self.dataset(arm)), self.vectors, policy)
 
     def evaluate(self, arm: str, seed: int, kept: Path) -> Path:
-        """A policy's results, as a file of the folder ``kept``, to be committed."""
+        """Evaluate a policy; write its results into the folder ``kept``, to be committed, and return the file."""
         self.train(arm, seed)
         import evaluation
         from model_server import running
@@ -93,19 +93,19 @@ class Work:
 
         policy = self.policy(arm, seed)
         weights = checksum(policy / "model.safetensors")
-        # What a policy did that was trained before under the same settings is not this one's.
+        # The label has the weights' hash, as an earlier policy of the same settings has different results.
         label = f"{policy.name}_{weights[:8]}"
         folder = self.out / "evaluations" / label
-        tasks, own_tasks = (self.out / "task_lists" / f"{label}{part}.json" for part in ("", "_own"))
+        tasks, libero_tasks = (self.out / "task_lists" / f"{label}{part}.json" for part in ("", "_own"))
         tested = evaluation.tested(self.experiment)
         write_tasks(tested, 0, tasks)
         server = running(str(HERE / "server.py"), "--args.folder", str(policy))
         with self._timed(f"evaluation {policy.name}"), server as address:
             words = ["evaluate", str(folder), "--server", address, "--label", label, "--tasks-from", str(tasks)]
             run("-m", "pipeline", *words)
-            own, black = [task for task in tested if task.source == "libero"], folder / "black"
-            write_tasks(own, 0, own_tasks)
-            words[1], words[-1] = str(black), str(own_tasks)
+            in_libero, black = [task for task in tested if task.source == "libero"], folder / "black"
+            write_tasks(in_libero, 0, libero_tasks)
+            words[1], words[-1] = str(black), str(libero_tasks)
             run("-m", "pipeline", *words, "--black", "all")
             reading = evaluation.tell(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)
@@ -125,13 +125,13 @@ class Work:
         )
         settings["run"] = self.experiment.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"})
         rows = [row for row in EpisodeFiles(folder).rows() if row.trial[0] in tested]
-        seen = [row for row in EpisodeFiles(black).rows() if row.trial[0] in own]
+        seen = [row for row in EpisodeFiles(black).rows() if row.trial[0] in in_libero]
         nothing = [{"task": row.base, "state": row.number, "success": row.success} for row in seen]
         return PolicyResults(arm, seed, settings, made, rows, reading, nothing).write(kept)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
-        """What runs in it is added to ``times.jsonl``: wall and CPU seconds, of its processes too."""
+        """Add the wall and CPU seconds of the context, child processes included, to ``times.jsonl``."""
         wall, cpu = time.perf_counter(), _cpu_s()
         try:
             yield
@@ -142,7 +142,7 @@ class Work:
                 file.write(json.dumps({"part": name, **taken}) + "\n")
 
     def _seconds(self) -> dict[str, list[float]]:
-        """Part to its wall and CPU seconds, those of stopped commands too."""
+        """Return part to its wall and CPU seconds, stopped commands included."""
         taken: dict[str, list[float]] = {}
         for entry in map(json.loads, (self.out / "times.jsonl").read_text().splitlines()):
             seconds, cpu_s = taken.get(entry["part"], (0.0, 0.0))
@@ -154,19 +154,20 @@ def run(*words: str) -> None:
     """Run a command of Python to its end.
 
     Raises:
-        PipelineError: when it fails.
+        PipelineError: if the command fails.
     """
     print("$ python", *words, flush=True)
-    path = os.pathsep.join(filter(None, (str(HERE.parents[1]), os.environ.get("PYTHONPATH"))))
+    folders = (str(HERE.parents[1]), os.environ.get("PYTHONPATH"))
+    path = os.pathsep.join(filter(None, folders))
     done = subprocess.run([sys.executable, *words], env={**os.environ, "PYTHONPATH": path}, check=False)
     if done.returncode:
         raise PipelineError(f"ended with {done.returncode}", where=" ".join(words), remedy="see above, and run again")
 
 
 def _cpu_s() -> float:
-    """Of this process and of those of its children that have ended."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    """Return the CPU seconds of this process and of its children that have ended."""
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def main() -> None:
@@ -189,7 +190,7 @@ def main() -> None:
 
 
 def do(arguments: argparse.Namespace) -> None:
-    """Take the step that the command line names."""
+    """Run the step that the command line names."""
     if arguments.step == "table":
         import comparison
 

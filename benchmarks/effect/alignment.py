@@ -1,11 +1,11 @@
-"""Does a policy see in the evaluation what it saw in training, at the step that the action belongs to?
+"""Alignment of training and evaluation: a policy must get the same observation at the step of the same action.
 
     python benchmarks/effect/alignment.py CONFIG
 
-For a finished run of starter demonstrations with `export: {lerobot: {frames: images}}`: sends the actions of each clean
-episode in the evaluation, and compares frame and state before each action with those of the dataset at the same step,
-one before and one after. Both differences must be smallest at the same step. The last line is JSON: median differences
-of grey levels and of states by shift.
+The script needs a finished run of starter demonstrations with `export: {lerobot: {frames: images}}`. It sends the
+actions of each clean episode in the evaluation. It compares frame and state before each action with those of the
+dataset at the same step, one step before, and one step after. Both differences must be smallest at the same step. The
+last line is JSON: median differences of grey levels and of states by shift.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from pipeline.evaluation.policies import VIEWS, Wanted
 from pipeline.evaluation.selection import Selection, select
 from pipeline.formats.registry import formats_of
 from pipeline.images.jpeg import decode
-from pipeline.types import Floats
+from pipeline.types import Floats, Frame
 
 KEYS = {name: SCHEMA.views[view].lerobot_key for name, view in VIEWS.items()}
 SHIFTS = (-1, 0, 1)
@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="configuration of the run, with frames: images")
     config = load(parser.parse_args().data)
-    (root,) = (one.root for one in formats_of(config.data, config.export) if one.name == "lerobot")
+    (root,) = (target.root for target in formats_of(config.data, config.export) if target.name == "lerobot")
     columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *KEYS.values()]
     table = pq.read_table(root / "data", columns=columns)
     environment = EpisodeEnvironment(EpisodeSettings(initial_states="demonstration"))
@@ -51,27 +51,28 @@ def main() -> None:
 
 
 def compare(environment: EpisodeEnvironment, episode: dict[str, list[object]]) -> dict[str, object]:
-    """Send an episode's actions; median difference to the dataset by what is compared and by shift."""
-    frames = {view: [decode(frame["bytes"]) for frame in episode[key]] for view, key in KEYS.items()}  # type: ignore[index]
+    """Send an episode's actions; return the median differences from the dataset by quantity and by shift."""
+    frames: dict[str, list[Frame]] = {}
+    for view, key in KEYS.items():
+        frames[view] = [decode(frame["bytes"]) for frame in episode[key]]  # type: ignore[index]
     states: Floats = np.array(episode[SCHEMA.state.lerobot_key])
     actions: Floats = np.array(episode[SCHEMA.action.lerobot_key])
-    differences: dict[str, dict[int, list[float]]] = {
-        name: {shift: [] for shift in SHIFTS} for name in (*VIEWS, "state")
-    }
+    differences: dict[str, dict[int, list[float]]] = {}
+    for name in (*VIEWS, "state"):
+        differences[name] = {shift: [] for shift in SHIFTS}
     for step, action in enumerate(actions):
         seen = environment.observation(Wanted())
         for shift in SHIFTS:
-            other = min(max(step + shift, 0), len(actions) - 1)
+            shifted_step = min(max(step + shift, 0), len(actions) - 1)
             for view in VIEWS:
-                apart = np.abs(seen["images"][view].astype(float) - frames[view][other])
+                apart = np.abs(seen["images"][view].astype(float) - frames[view][shifted_step])
                 differences[view][shift].append(float(apart.mean()))
-            differences["state"][shift].append(float(np.abs(seen["states"] - states[other]).max()))
+            differences["state"][shift].append(float(np.abs(seen["states"] - states[shifted_step]).max()))
         if environment.step(action).over:
             break
-    medians = {
-        name: {str(shift): round(float(np.median(values)), 5) for shift, values in by_shift.items()}
-        for name, by_shift in differences.items()
-    }
+    medians: dict[str, dict[str, float]] = {}
+    for name, by_shift in differences.items():
+        medians[name] = {str(shift): round(float(np.median(values)), 5) for shift, values in by_shift.items()}
     largest = {name: round(max(by_shift[0]), 5) for name, by_shift in differences.items()}
     progress = environment.progress
     return {"median": medians, "largest_at_same_step": largest, "steps": progress.steps, "success": progress.success}

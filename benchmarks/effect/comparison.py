@@ -1,4 +1,4 @@
-"""Table and plot of the results: success by axis and arm, paired differences, and which goals instructions reach."""
+"""Table and plot of the results: success by axis and arm, paired differences, and reached goals by instruction."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -14,65 +14,73 @@ from pipeline.files import replaced, write
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 FURTHER = Path(__file__).with_name("further") / "results"
-"""A folder of results for each further experiment."""
+"""Folder with one subfolder of results for each further experiment."""
 
 BESIDE = {"starts": "no_state"}
-"""A further experiment to the one whose arms stand beside its own: the same policies, tests and demonstrations."""
+"""Further experiment to a second one whose arms join its table: both share policies, tests and demonstrations."""
 
 LINES = {"clean": "LIBERO's own", "robot": "robot", "language": "language", "pose": "pose", "camera": "camera, noise"}
 LINE_OF = {axis: axis for axis in LINES} | {"noise": "camera"}
 COLOURS = ("#6b7d94", "#e59a00", "#1f9e82", "#9467d6")
 
 Rows = Mapping[int, Sequence[EpisodeResult]]
-"""Seed to the episodes of an arm's policy."""
+"""Seed to the episodes of an arm's policy with that seed."""
 
 
 def of_line(results: Sequence[PolicyResults], line: str) -> dict[str, Rows]:
-    """Arm to its episodes of one line of the table."""
-    found: dict[str, dict[int, list[EpisodeResult]]] = defaultdict(dict)
-    for one in results:
-        found[one.arm][one.seed] = [row for row in one.rows if LINE_OF[row.axis] == line]
-    return dict(found)
+    """Select the episodes of one line of the table by arm."""
+    episodes: dict[str, dict[int, list[EpisodeResult]]] = defaultdict(dict)
+    for policy in results:
+        episodes[policy.arm][policy.seed] = [row for row in policy.rows if LINE_OF[row.axis] == line]
+    return dict(episodes)
 
 
 def lines_of(results: Sequence[PolicyResults]) -> list[str]:
-    """The lines that there are episodes of."""
-    there = {LINE_OF[row.axis] for one in results for row in one.rows}
-    return [line for line in LINES if line in there]
+    """List the lines of the table that have episodes."""
+    lines_with_episodes: set[str] = set()
+    for policy in results:
+        lines_with_episodes |= {LINE_OF[row.axis] for row in policy.rows}
+    return [line for line in LINES if line in lines_with_episodes]
+
+
+def arms_of(results: Sequence[PolicyResults]) -> list[str]:
+    """List the arms in the order of the results, each once."""
+    return list(dict.fromkeys(policy.arm for policy in results))
 
 
 def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
-    """Each two arms on each line: ``value`` (second minus first), ``low``, ``high``, ``p_value``, and ``holm``.
+    """Compare each two arms on each line: ``value`` (second minus first), ``low``, ``high``, ``p_value``, ``holm``.
 
-    Episodes are paired by seed, test tasks are drawn anew within the tasks of the scene, each with all seeds.
-    ``p_value`` is the larger of that and of ``sign_flip``: where few tests differ, resampling says too little. ``holm``
-    is the p-value by Holm (1979) over the lines of the two arms.
+    Episodes are paired by seed. Test tasks are resampled within the tasks of the scene, each with all seeds.
+    ``p_value`` is the larger p-value of resampling and of ``sign_flip``, as resampling is unreliable if few tests
+    differ. ``holm`` is the p-value by Holm (1979) over the lines of the two arms.
     """
-    arms = list(dict.fromkeys(one.arm for one in results))
-    found = []
-    for first, second in combinations(arms, 2):
-        lines = []
+    compared: list[dict[str, Any]] = []
+    for first, second in combinations(arms_of(results), 2):
+        lines: list[dict[str, Any]] = []
         for line in lines_of(results):
-            of = of_line(results, line)
-            seeds = of[first].keys() & of[second].keys()
-            pairs = [pair for seed in sorted(seeds) for pair in paired(of[first][seed], of[second][seed])]
+            episodes = of_line(results, line)
+            seeds = episodes[first].keys() & episodes[second].keys()
+            pairs: list[Pair] = []
+            for seed in sorted(seeds):
+                pairs += paired(episodes[first][seed], episodes[second][seed])
             if pairs:
                 measured = compare(pairs)["all"]["difference"]
                 p_value = max(measured["p_value"] or 0.0, sign_flip(pairs))
                 lines.append({"first": first, "second": second, "line": line, **measured, "p_value": p_value})
-        adjusted = holm([one["p_value"] for one in lines])
-        found += [{**one, "holm": p_value} for one, p_value in zip(lines, adjusted, strict=True)]
-    return found
+        adjusted = holm([difference["p_value"] for difference in lines])
+        compared += [{**difference, "holm": p_value} for difference, p_value in zip(lines, adjusted, strict=True)]
+    return compared
 
 
 def sign_flip(pairs: Sequence[Pair]) -> float:
-    """The exact two-sided p-value of two arms' total difference (Fisher, 1935).
+    """Compute the exact two-sided p-value of two arms' total difference (Fisher, 1935).
 
-    Where the arms are equal, each test's difference, of all its seeds together, has either sign as likely.
+    If the arms are equal, both signs of a test's difference over all its seeds are equally likely.
     """
     by_trial: Counter[Trial] = Counter()
-    for one, other in pairs:
-        by_trial[one.trial] += other.success - one.success
+    for first, second in pairs:
+        by_trial[first.trial] += second.success - first.success
     totals = Counter({0: 1})
     for value in by_trial.values():
         flipped: Counter[int] = Counter()
@@ -85,7 +93,7 @@ def sign_flip(pairs: Sequence[Pair]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjusted p-values: the smallest times their number, the next times one less, never falling (Holm, 1979)."""
+    """Adjust p-values: multiply the smallest by their number, the next by one less, never falling (Holm, 1979)."""
     adjusted, most = [1.0] * len(p_values), 0.0
     for rank, place in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
         most = max(most, min(1.0, (len(p_values) - rank) * p_values[place]))
@@ -94,65 +102,96 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def reading(results: Sequence[PolicyResults], arm: str) -> dict[str, Counter[str | None]]:
-    """Instruction to how often each goal was reached, all seeds together."""
+    """Count the reached goals of each instruction, over all seeds."""
     counts: dict[str, Counter[str | None]] = defaultdict(Counter)
-    for row in chain.from_iterable(one.reading for one in results if one.arm == arm):
-        counts[row["instruction"]][row["reached"]] += 1
+    for policy in results:
+        if policy.arm != arm:
+            continue
+        for row in policy.reading:
+            counts[row["instruction"]][row["reached"]] += 1
     return dict(counts)
 
 
 def markdown(results: Sequence[PolicyResults]) -> str:
-    """All tables."""
-    arms = list(dict.fromkeys(one.arm for one in results))
-    rows = [["tests", "episodes", *arms]]
-    for line in lines_of(results):
-        of = of_line(results, line)
-        rows.append([LINES[line], str(len(next(iter(of[arms[0]].values())))), *(_solved(of[arm]) for arm in arms)])
-    if any(one.black for one in results):
-        black = [[[row["success"] for row in one.black] for one in results if one.arm == arm] for arm in arms]
-        number = max(len(seed) for seeds in black for seed in seeds)
-        rows.append(["LIBERO's own, views black", str(number), *map(_rates, black)])
-    text = "Success, in brackets of each seed:\n\n" + _table(rows)
-    cells: dict[str, dict[str, str]] = defaultdict(dict)
-    for one in differences(results):
-        bounds = "" if one["low"] is None else f" ({100 * one['low']:+.0f} to {100 * one['high']:+.0f})"
-        pair = f"{one['second']} - {one['first']}"
-        p_value = f", p {one['holm']:.2g}" if one["holm"] < 1 else ""
-        cells[LINES[one["line"]]][pair] = f"{100 * one['value']:+.0f}{bounds}{p_value}"
-    if cells:
-        rows = [["tests", *next(iter(cells.values()))], *([line, *of.values()] for line, of in cells.items())]
+    """Return all tables as Markdown."""
+    text = "Success, in brackets of each seed:\n\n" + _table(_success_rows(results))
+    rows = _difference_rows(results)
+    if rows:
         text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n"
         text += _table(rows)
+    text += "\nHow often its goal is reached, and others by name, by what the policy is told:\n\n"
+    return text + _table(_reading_rows(results))
+
+
+def _success_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
+    """Return the success rates by line and arm, with those of black views if there are any."""
+    arms = arms_of(results)
+    rows = [["tests", "episodes", *arms]]
+    for line in lines_of(results):
+        episodes = of_line(results, line)
+        of_first_policy = next(iter(episodes[arms[0]].values()))
+        rows.append([LINES[line], str(len(of_first_policy)), *(_solved(episodes[arm]) for arm in arms)])
+    if any(policy.black for policy in results):
+        black: dict[str, list[list[bool]]] = {arm: [] for arm in arms}
+        for policy in results:
+            black[policy.arm].append([row["success"] for row in policy.black])
+        number = max(len(trials) for trials in chain.from_iterable(black.values()))
+        rows.append(["LIBERO's own, views black", str(number), *map(_rates, black.values())])
+    return rows
+
+
+def _difference_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
+    """Return the differences by line and pair of arms; an empty list if there is no pair."""
+    cells: dict[str, dict[str, str]] = defaultdict(dict)
+    for row in differences(results):
+        bounds = "" if row["low"] is None else f" ({100 * row['low']:+.0f} to {100 * row['high']:+.0f})"
+        pair = f"{row['second']} - {row['first']}"
+        p_value = f", p {row['holm']:.2g}" if row["holm"] < 1 else ""
+        cells[LINES[row["line"]]][pair] = f"{100 * row['value']:+.0f}{bounds}{p_value}"
+    if not cells:
+        return []
+    pairs = next(iter(cells.values()))
+    return [["tests", *pairs], *([line, *texts.values()] for line, texts in cells.items())]
+
+
+def _reading_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
+    """Return the counts of reached goals by instruction and arm."""
+    arms = arms_of(results)
     tasks = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
     reached = {arm: reading(results, arm) for arm in arms}
     rows = [["told", *arms]]
-    for told in reached[arms[0]]:
-        rows.append([told or "nothing", *(_reached(counts[told], told, tasks) for counts in reached.values())])
-    return text + "\nHow often its goal is reached, and others by name, by what the policy is told:\n\n" + _table(rows)
+    for instruction in reached[arms[0]]:
+        cells = [_reached(counts[instruction], instruction, tasks) for counts in reached.values()]
+        rows.append([instruction or "nothing", *cells])
+    return rows
 
 
-def _reached(counts: Counter[str | None], told: str, tasks: Sequence[str]) -> str:
-    asked = told.replace(" ", "_")
-    others = [f"{_short(task)} {counts[task]}" for task in tasks if counts[task] and task != asked]
-    own = [str(counts[asked])] if asked in tasks else []
-    return f"{', '.join([*own, *others]) or 0} of {counts.total()}"
+def _reached(counts: Counter[str | None], instruction: str, tasks: Sequence[str]) -> str:
+    asked = instruction.replace(" ", "_")
+    asked_count = [str(counts[asked])] if asked in tasks else []
+    other_counts = [f"{_short(task)} {counts[task]}" for task in tasks if counts[task] and task != asked]
+    return f"{', '.join([*asked_count, *other_counts]) or 0} of {counts.total()}"
 
 
 def _solved(seeds: Rows) -> str:
-    return _rates([[row.success for row in rows] for rows in seeds.values()])
+    successes: list[list[bool]] = []
+    for rows in seeds.values():
+        successes.append([row.success for row in rows])
+    return _rates(successes)
 
 
 def _rates(seeds: Sequence[Sequence[bool]]) -> str:
-    """Of all seeds that were tried, and of each where there are several."""
+    """Return the success rate of all seeds with trials, followed by each seed's rate if there are several."""
     tried = [seed for seed in seeds if seed]
     if not tried:
         return "-"
-    all_of_them, *each = (f"{100 * sum(trials) / len(trials):.0f}" for trials in ([*chain(*tried)], *tried))
-    return f"{all_of_them} %" + (f" ({', '.join(each)})" if len(each) > 1 else "")
+    together, *by_seed = (f"{100 * sum(trials) / len(trials):.0f}" for trials in ([*chain(*tried)], *tried))
+    return f"{together} %" + (f" ({', '.join(by_seed)})" if len(by_seed) > 1 else "")
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
-    return "".join("| " + " | ".join(row) + " |\n" for row in [rows[0], ["---"] * len(rows[0]), *rows[1:]])
+    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def _short(task: str) -> str:
@@ -160,18 +199,18 @@ def _short(task: str) -> str:
 
 
 def plot(results: Sequence[PolicyResults], file: Path) -> None:
-    """Success by line and arm, with Wilson's 95 % interval, and each seed as a dot."""
+    """Plot success by line and arm, with Wilson's 95 % interval, and each seed as a dot."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 3), layout="constrained")
     axes = figure.add_subplot()
-    arms = list(dict.fromkeys(one.arm for one in results))
+    arms = arms_of(results)
     for place, arm in enumerate(arms):
         for number, line in enumerate(lines_of(results)):
             seeds = of_line(results, line)[arm]
             rate = success_rate([*chain.from_iterable(seeds.values())])
-            # All seeds act in the same tasks, so that they are no further trials.
+            # All seeds act in the same tasks; they do not count as additional trials.
             low, high = wilson(rate["successes"] / len(seeds), rate["episodes"] / len(seeds))
             x, height = number + 0.8 * (place + 0.5) / len(arms) - 0.4, 100 * rate["rate"]
             spread = [[height - 100 * low], [100 * high - height]]
@@ -189,22 +228,22 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
 
 
 def publish(folder: Path, docs: Path = DOCS) -> str:
-    """Write the table of a folder's results into docs/effect.md, and the plot beside it; returns the table.
+    """Write the table of a folder's results into docs/effect.md, and the plot next to it; return the table.
 
-    Those of the further experiments go into docs/decisions.md.
+    The tables of the further experiments go into docs/decisions.md.
     """
     results = read(folder)
     text = markdown(results) + "\n![success by tests and arm](effect.svg)\n"
     plot(results, docs / "effect.svg")
     _write(docs / "effect.md", "table", text)
     for further in sorted(FURTHER.iterdir()):
-        beside = read(FURTHER / BESIDE[further.name]) if further.name in BESIDE else []
-        _write(docs / "decisions.md", further.name, markdown([*beside, *read(further)]))
+        joined = read(FURTHER / BESIDE[further.name]) if further.name in BESIDE else []
+        _write(docs / "decisions.md", further.name, markdown([*joined, *read(further)]))
     return text
 
 
 def _write(page: Path, name: str, text: str) -> None:
-    """Replace what stands between two marks of a page."""
+    """Replace the text between two marks of a page."""
     before, _, rest = page.read_text().partition(f"<!-- {name} -->\n")
     _, end, after = rest.partition(f"<!-- end of {name} -->")
     assert end, f"{page} has no marks of {name}"

@@ -1,4 +1,4 @@
-"""The episodes that an arm is trained on, from demonstrations to small frames in one file."""
+"""Episodes for the training of an arm, from demonstrations to small frames in one file."""
 
 import json
 from collections import Counter, defaultdict
@@ -32,12 +32,12 @@ from pipeline.testset import benchmark
 
 VIEWS = ("image", "wrist_image")
 COLUMNS = ("episode_id", "demo_id", "task", "axis", "component", "level", "instruction")
-"""What is kept of each episode's row of the plan."""
+"""Columns of the plan that are kept for each episode."""
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """All steps of an arm's episodes, one episode after the other.
+    """Steps of an arm's episodes, one episode after the other.
 
     Attributes:
         images: view to (N, P, P, 3) uint8 RGB.
@@ -53,18 +53,18 @@ class Dataset:
     episodes: list[dict[str, Any]]
 
     def axes(self) -> dict[str, int]:
-        """Axis or combination to its number of episodes."""
+        """Count the episodes of each axis or combination."""
         return dict(sorted(Counter(row["axis"] for row in self.episodes).items()))
 
 
 def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: Vectors, file: Path) -> None:
-    """Plan, replay and render an arm's episodes and nothing else, and write them.
+    """Plan, replay and render only an arm's episodes, and write them.
 
-    Stopped at any time, it goes on: replays and frames are kept beside the file.
+    A stopped command resumes: replays and frames are kept next to the file.
 
     Raises:
-        PipelineError: before anything is replayed, when there are too few demonstrations, a draw is too near to a test
-            task, or a sentence has no embedding; before anything is rendered, when fewer episodes than wanted are kept.
+        PipelineError: before any replay, if there are too few demonstrations, a perturbation is too near to a test
+            task, or a sentence has no embedding. Before any rendering, if fewer episodes than wanted are kept.
     """
     rows, chosen = planned(experiment, arm, demos)
     for row in chosen:
@@ -76,8 +76,8 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
     frames, trajectories = FrameStore(folder / "frames", run.render), TrajectoryStore(folder / "trajectories")
     with runner(run.compute, folder, renders=True) as workers:
         rejected: dict[str, str] | None = None
-        while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
-            rejected = known
+        while (rejected_now := rejections(rows, shown_of(frames.rows()))) != rejected:
+            rejected = rejected_now
             Replays(run.demos, run.replay, trajectories.root, workers, run.filter).of(rows, rejected)
             outcome = selection.select(chosen, verdicts_of(trajectories.rows(), chosen, run.filter), rejected)
             kept = [row for row in chosen if outcome[row.episode_id].kept]
@@ -94,12 +94,12 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
 
 
 def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tuple[list[plan.Row], list[plan.Row]]:
-    """The plan of an arm, in which each demonstration gives one episode; and the rows of it that the arm may show.
+    """Plan an arm with one episode per demonstration; return all rows, and the rows that the arm may use.
 
-    The other rows are the clean twins of demonstrations that the arm has perturbed episodes of.
+    All other rows are the clean twins of demonstrations with perturbed episodes.
 
     Raises:
-        PipelineError: when a task has fewer demonstrations than wanted.
+        PipelineError: if a task has fewer demonstrations than wanted.
     """
     by_task: dict[str, list[DemoEntry]] = defaultdict(list)
     for demo in demos:
@@ -116,44 +116,48 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
         end = begin + wanted.episodes[name] // len(by_task)
         axes = wanted.axes.model_copy(update=dict.fromkeys(wanted.axes.drawn().keys() - axes_of(name)))
         config = PlanConfig(seed=wanted.seed, axes=axes, episodes={name: wanted.episodes[name]}, reserve=wanted.reserve)
-        group = [demo for task in experiment.tasks for demo in by_task[task][begin:end]]
+        group: list[DemoEntry] = []
+        for task in experiment.tasks:
+            group += by_task[task][begin:end]
         rows += plan.make(group, config, experiment.run.replay, benchmark.load())
         begin = end
-    # After the twins that perturbed episodes follow, all of which are needed.
-    clean = [
-        replace(row, rank=begin + row.rank, wanted=begin + row.rank < experiment.demonstrations)
-        for task in experiment.tasks
-        for row in plan.twins(by_task[task][begin:], wanted.seed, experiment.run.replay)
-    ]
+    # Their ranks follow those of the perturbed episodes' twins, all of which are needed.
+    clean: list[plan.Row] = []
+    for task in experiment.tasks:
+        for row in plan.twins(by_task[task][begin:], wanted.seed, experiment.run.replay):
+            rank = begin + row.rank
+            clean.append(replace(row, rank=rank, wanted=rank < experiment.demonstrations))
     return rows + clean, [row for row in rows if row.role == "perturbed"] + clean
 
 
 def _write(rows: Sequence[plan.Row], load: EpisodeLoader, frame_px: int, workers: Workers, file: Path) -> None:
     small = workers(partial(_small, load, frame_px), [row.episode_id for row in rows], "frames made small")
-    columns = {name: np.concatenate([one[name] for one in small]) for name in small[0]}
+    columns: dict[str, Any] = {}
+    for name in small[0]:
+        columns[name] = np.concatenate([episode[name] for episode in small])
+    lengths = np.array([len(episode["action"]) for episode in small])
+    facts: list[dict[str, Any]] = []
+    for row in rows:
+        facts.append({name: getattr(row, name) for name in COLUMNS})
     with replaced(file) as temporary, temporary.open("wb") as out:
-        np.savez(
-            out,
-            **columns,
-            lengths=np.array([len(one["action"]) for one in small]),
-            episodes=np.array(json.dumps([{name: getattr(row, name) for name in COLUMNS} for row in rows])),
-        )
+        np.savez(out, **columns, lengths=lengths, episodes=np.array(json.dumps(facts)))
 
 
 def _small(load: EpisodeLoader, frame_px: int, episode_id: str) -> dict[str, NDArray[Any]]:
-    """An episode's frames, states and actions."""
+    """Return an episode's small frames, states and actions."""
     episode = load(episode_id)
-    images = {
-        view: np.stack([resized(decode(frame), frame_px, frame_px) for frame in episode.frames[view]]) for view in VIEWS
-    }
+    images: dict[str, NDArray[Any]] = {}
+    for view in VIEWS:
+        frames = [resized(decode(frame), frame_px, frame_px) for frame in episode.frames[view]]
+        images[view] = np.stack(frames)
     return {**images, "state": episode.state, "action": episode.action}
 
 
 def read(file: Path) -> Dataset:
-    """What ``make`` wrote; an arm of 200 episodes of 90 steps takes 1 GB of memory.
+    """Read the output of ``make``; an arm of 200 episodes of 90 steps takes 1 GB of memory.
 
     Raises:
-        PipelineError: when it is not there.
+        PipelineError: if the file does not exist.
     """
     if not file.is_file():
         raise PipelineError("the arm has no data yet", where=file, remedy="make it first: the step `data`")

@@ -1,12 +1,13 @@
-"""What each policy is evaluated on: test tasks by ``python -m pipeline evaluate``, and whether it does what it is told.
+"""Evaluation of each policy: test tasks by ``python -m pipeline evaluate``, and its obedience to instructions.
 
-Four tasks of one scene differ by the instruction alone. From the same initial states the policy is told each of them,
-and nothing; what counts is which of the four goals it reaches first.
+Four tasks of one scene differ by the instruction alone. From the same initial states, the policy gets each instruction,
+and the empty one. The result is the first of the four goals that it reaches.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +26,21 @@ from pipeline.types import Task
 
 
 def tested(experiment: Experiment) -> list[EvaluationTask]:
-    """LIBERO's initial states and LIBERO-Plus's test tasks, as many of each of the experiment's tasks."""
+    """Select LIBERO's initial states and LIBERO-Plus's test tasks, equally many for each task of the experiment."""
     wanted = experiment.evaluation
-    found: list[EvaluationTask] = []
-    for suite, name in (task.split("/") for task in experiment.tasks):
-        found += select(Selection(suites=(suite,), tasks=(name,), episodes=wanted.states))
+    chosen: list[EvaluationTask] = []
+    for task in experiment.tasks:
+        suite, name = task.split("/")
+        chosen += select(Selection(suites=(suite,), tasks=(name,), episodes=wanted.states))
         for axis, number in wanted.libero_plus.items():
-            found += select(
-                Selection(source="libero_plus", suites=(suite,), tasks=(name,), axes=(axis,), subset=number)
-            )
-    return found
+            tests = Selection(source="libero_plus", suites=(suite,), tasks=(name,), axes=(axis,), subset=number)
+            chosen += select(tests)
+    return chosen
 
 
 @dataclass(frozen=True)
 class Telling:
-    """An episode in which a policy is told an instruction, in a scene that has other goals too."""
+    """Episode in which a policy gets an instruction, in a scene with several goals."""
 
     state: int
     instruction: str
@@ -50,23 +51,26 @@ class Telling:
 
 
 def tellings(experiment: Experiment) -> list[Telling]:
-    """Each instruction and the empty one from the last initial states of the first task."""
-    instructions = [task.instruction for task in _tasks(experiment)]
-    first = INITIAL_STATES - experiment.evaluation.reading_states
-    return [Telling(state, text) for state in range(first, INITIAL_STATES) for text in (*instructions, "")]
+    """Combine each instruction, and the empty one, with the last initial states of the first task."""
+    instructions = [*(task.instruction for task in _tasks(experiment)), ""]
+    states = range(INITIAL_STATES - experiment.evaluation.reading_states, INITIAL_STATES)
+    return [Telling(state, text) for state, text in product(states, instructions)]
 
 
 def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:
-    """Run the episodes that the folder does not have yet.
+    """Run the episodes without results in the folder.
 
     Args:
-        address: of the policy's model server.
+        experiment: the experiment.
+        address: address of the policy's model server.
+        folder: folder of the results.
 
     Returns:
-        A row for each: ``state``, ``instruction``, ``reached`` (the goal's task; None where it was none), ``steps``.
+        A row for each episode: ``state``, ``instruction``, ``reached`` (the goal's task, or ``None``), ``steps``.
     """
     wanted = tellings(experiment)
-    if missing := [telling for telling in wanted if not (folder / telling.file).exists()]:
+    missing = [telling for telling in wanted if not (folder / telling.file).exists()]
+    if missing:
         with runner(ComputeConfig(), folder, renders=True) as workers:
             job = partial(_tell, _tasks(experiment), address, folder)
             workers(job, [missing[::2], missing[1::2]], "reading, halves")
@@ -86,8 +90,8 @@ def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Te
         policy.begin(episode)
         reached: list[str] = []
 
-        def look(wanted: Wanted, told: str = telling.instruction) -> dict[str, Any]:
-            return environment.observation(wanted) | {"task_description": told}
+        def look(wanted: Wanted, instruction: str = telling.instruction) -> dict[str, Any]:
+            return environment.observation(wanted) | {"task_description": instruction}
 
         while not (progress.over or reached):
             for action in policy.act(look):

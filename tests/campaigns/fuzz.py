@@ -1,11 +1,11 @@
-"""Feeds damaged and hostile files to everything that reads one.
+"""Campaign that feeds damaged and hostile files to all readers of files.
 
     python tests/campaigns/fuzz.py [--cases 1000] [--seed 0] [--kinds plan recording ...]
 
-Each case changes a real file at random, by a key of its own, and reads it as the project does. It passes where the
-reader gives what was written, or raises a `PipelineError`, which names the file. Anything else is a fault: another
-error, a crash of the process, a hang, other values, and a file that was written outside of the case's folder. Cases run
-in processes of their own, so that a crash costs one. The last line is JSON.
+Each case changes a real file at random, by its own random key, and reads it as the project does. A case passes if the
+reader returns the written values, or raises a `PipelineError`, which names the file. All other outcomes are faults: a
+different error, a crash of the process, a hang, different values, or a file outside of the case's folder. Cases run in
+separate processes; a crash costs only one case. The last line is JSON.
 """
 
 import argparse
@@ -58,23 +58,23 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Rendered, Scene, Trajectory, Verdict
 
 LIMIT_S = 20
-"""What takes longer counts as a hang."""
+"""Time limit of a case; a longer case counts as a hang."""
 
 CHUNK = 25
-"""So many cases run in one process."""
+"""Number of cases in one process."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of file.
+    """Kind of file.
 
     Attributes:
-        name: of the file in a case's folder.
-        make: the content of a good one.
-        read: reads it; what it returns must be the same for a good file each time.
-        exact: whether a changed file must be refused or give the same values. Else any values will do: such a file is
-            written by people, and a changed one may be another good one.
-        text: whether it is changed word by word too.
+        name: name of the file in a case's folder.
+        make: returns the content of a good file.
+        read: reads a file; it must return equal values for a good file each time.
+        exact: a changed file must be rejected or give equal values. If false, any values pass: people write such a
+            file, and a changed file may be good too.
+        text: the file is changed word by word too.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Kind:
 
 
 def changed(content: bytes, text: bool, rng: random.Random) -> bytes:
-    """A file with one to three changes."""
+    """Apply one to three random changes to a file."""
     ways: list[Callable[[bytes, random.Random], bytes]] = [_flip, _cut, _zero, _repeat, _insert]
     if text:
         ways += [_extreme, _extreme, _extreme, _drop_line, _swap_lines]
@@ -124,7 +124,7 @@ NUMBERS = ("0", "-1", "1e300", "-1e300", "nan", ".nan", "inf", ".inf", "1e-320",
 WORDS = ("null", "true", "''", "'\x00'", "[]", "{}", "{{", "%(a)s", "\ud7ff", "x" * 10_000)
 HOSTILE = ("../../../etc/passwd", "/etc/passwd", "*x", "!!python/name:os.system", "$(touch pwned)", "; touch pwned")
 EXTREMES = (*NUMBERS, *WORDS, *HOSTILE)
-"""What a word or a number is replaced by."""
+"""Replacements of a word or a number."""
 
 
 def _extreme(content: bytes, rng: random.Random) -> bytes:
@@ -144,9 +144,12 @@ def _drop_line(content: bytes, rng: random.Random) -> bytes:
 
 def _swap_lines(content: bytes, rng: random.Random) -> bytes:
     lines = content.splitlines(keepends=True)
-    rng.shuffle(lines) if len(lines) < 5 else lines.insert(
-        rng.randrange(len(lines)), lines.pop(rng.randrange(len(lines)))
-    )
+    if len(lines) < 5:
+        rng.shuffle(lines)
+    else:
+        target = rng.randrange(len(lines))
+        line = lines.pop(rng.randrange(len(lines)))
+        lines.insert(target, line)
     return b"".join(lines)
 
 
@@ -263,9 +266,10 @@ def _recording() -> bytes:
     def write(folder: Path) -> Path:
         demo = starter_demo(STOVE)
         states = np.tile(demo.init_state, (20, 1))
-        one = hdf5.Recording(demo.actions[:20], states, states[:, :9], _model_xml(), {})
+        first = hdf5.Recording(demo.actions[:20], states, states[:, :9], _model_xml(), {})
+        second = hdf5.Recording(demo.actions[1:21], states, states[:, :9], _model_xml(), {})
         file = folder / f"{STOVE.name}_demo.hdf5"
-        hdf5.write(file, STOVE, [one, one.__class__(demo.actions[1:21], states, states[:, :9], _model_xml(), {})])
+        hdf5.write(file, STOVE, [first, second])
         return file
 
     return _in_temporary(write)
@@ -280,7 +284,7 @@ def _read_recording(file: Path) -> object:
 
 
 def _read_model(file: Path) -> object:
-    """As a replay does: relocated, compiled by MuJoCo, and stepped."""
+    """Read a model as a replay does: relocate it, compile it with MuJoCo, and step it."""
     from pipeline.errors import RefusedError
     from pipeline.physics.environment import shared
 
@@ -307,12 +311,12 @@ def _image() -> bytes:
 
 
 def _read_answer(file: Path) -> object:
-    """A model server's answer, as msgpack gives it."""
+    """Read a model server's answer in msgpack's format."""
     import msgpack
 
     try:
         answer = msgpack.unpackb(file.read_bytes(), strict_map_key=False)
-    except Exception as error:  # not ours: the connection's
+    except Exception as error:  # the connection's error, not ours
         raise PipelineError(f"not msgpack ({error})", where=file) from error
     return checked_actions(answer, str(file)).tolist()
 
@@ -346,7 +350,7 @@ KINDS = {
 
 
 class HungError(Exception):
-    """It took too long."""
+    """Error of a case that exceeds the time limit."""
 
 
 def _hung(number: int, frame: object) -> None:
@@ -354,7 +358,7 @@ def _hung(number: int, frame: object) -> None:
 
 
 def run_cases(kind: str, numbers: Iterable[int], seed: int, report: Callable[[dict[str, Any]], None]) -> None:
-    """Run cases of a kind in this process; ``report`` gets a line before each and one after it."""
+    """Run cases of a kind in this process; ``report`` gets a line before and a line after each case."""
     subject = KINDS[kind]
     content = subject.make()
     signal.signal(signal.SIGALRM, _hung)
@@ -365,9 +369,8 @@ def run_cases(kind: str, numbers: Iterable[int], seed: int, report: Callable[[di
         for number in numbers:
             report({"kind": kind, "case": number})
             rng = random.Random(f"{seed} {kind} {number}")
-            outcome, value = _outcome(
-                subject, Path(temporary) / str(number) / "episodes", changed(content, subject.text, rng)
-            )
+            folder = Path(temporary) / str(number) / "episodes"
+            outcome, value = _outcome(subject, folder, changed(content, subject.text, rng))
             if outcome == "read" and subject.exact and value != expected[1]:
                 outcome, value = "other values", None
             report({"kind": kind, "case": number, "outcome": outcome, "detail": str(value)[:300] if value else ""})
@@ -391,7 +394,7 @@ def _outcome(subject: Kind, folder: Path, content: bytes) -> tuple[str, Any]:
 
 
 def check(kinds: Iterable[str], cases: int, seed: int) -> tuple[Counter[str], list[str]]:
-    """So many cases, spread over the kinds; outcomes, and what was found."""
+    """Run ``cases`` cases, spread over the kinds; return the outcomes and the faults."""
     outcomes: Counter[str] = Counter()
     faults: list[str] = []
     listed = list(kinds)
@@ -400,7 +403,8 @@ def check(kinds: Iterable[str], cases: int, seed: int) -> tuple[Counter[str], li
         while left:
             with tempfile.TemporaryDirectory() as folder:
                 lines, crash = _in_a_process(kind, left[:CHUNK], seed, Path(folder))
-                outcomes["files elsewhere"] += len(stray := sorted(path.name for path in Path(folder).iterdir()))
+                stray = sorted(path.name for path in Path(folder).iterdir())
+                outcomes["files elsewhere"] += len(stray)
             faults += [f"{kind}: wrote {name} into the working folder" for name in stray if name != "MUJOCO_LOG.TXT"]
             done = [line for line in lines if "outcome" in line]
             for line in done:

@@ -1,7 +1,8 @@
-"""Results of a few short real episodes, written down: `python tests/campaigns/golden.py` adds what is not yet there.
+"""Recorded results of a few short real episodes; `python tests/campaigns/golden.py` adds missing results.
 
-Numbers that are there are never written over. Where a result has changed, raise its step's number in
-``pipeline.identity.RECIPES`` in the same commit and run this again: then every stored file of that step is made anew.
+Recorded results are never overwritten. If a result has changed, raise its step's number in
+``pipeline.identity.RECIPES`` in the same commit, and run this script again. The new number generates every stored file
+of that step again.
 """
 
 import hashlib
@@ -34,21 +35,21 @@ from pipeline.types import Floats, Frame, Trajectory
 
 FILE = Path(__file__).with_name("golden.json")
 STEPS = 25
-"""How much of a trajectory is written down; later, contacts magnify what two processors compute differently."""
+"""Recorded steps of a trajectory; later, contacts magnify differences between two processors."""
 DECIMALS = 6
 CELLS = 8
-"""Thumbnails are CELLS x CELLS means: what any renderer must show, to a grey level or so."""
+"""Thumbnails are CELLS x CELLS means, which any renderer must reproduce to about a grey level."""
 
 
 @dataclass
 class Golden:
-    """What the recorded cases come to here and now."""
+    """Current results of the recorded cases on this machine."""
 
     cases: dict[str, str]
 
     @cached_property
     def trajectories(self) -> dict[str, Trajectory]:
-        """Case to replay, for the clean one and those that change physics."""
+        """Return case to replay, for the clean case and all cases that change physics."""
         task = find_task("libero_goal", "put_the_bowl_on_the_plate")
         demo = StarterSource().of(task)
         environment = Environment(task)
@@ -56,17 +57,19 @@ class Golden:
         reference = Reference.of(clean.model_xml, clean.states, clean.actions)
         replays = {"clean": clean}
         for case, listed in self.cases.items():
-            if physics := of_layer(from_json(listed), PhysicsPerturbation):
+            physics = of_layer(from_json(listed), PhysicsPerturbation)
+            if physics:
                 config = ReplayConfig(mode="tracked" if case == "robot" else "open_loop")
                 replays[case] = replay(environment, demo, case, config, physics, lambda: reference)
         environment.close()
-        if refused := [case for case, trajectory in replays.items() if not len(trajectory.actions)]:
+        refused = [case for case, trajectory in replays.items() if not len(trajectory.actions)]
+        if refused:
             raise ValueError(f"refused in this scene, so they show nothing: {refused}")
         return replays
 
     @cached_property
     def frames(self) -> dict[str, Frame]:
-        """``<case> <camera>`` to the first frame."""
+        """Return ``<case> <camera>`` to the first frame."""
         frames: dict[str, Frame] = {}
         trajectories = {case: self.trajectories.get(case, self.trajectories["clean"]) for case in self.cases}
         # An open scene takes half a gigabyte and two seconds: each is opened once, and closed before the next.
@@ -89,14 +92,14 @@ class Golden:
         return {name: np.round(thumbnail(frame), 1).tolist() for name, frame in self.frames.items()}
 
     def encoding(self) -> str:
-        """Of a picture that no renderer made."""
+        """Return the digest of an encoded synthetic picture."""
         rows, columns = np.mgrid[0:256, 0:256]
         picture = np.stack([rows, columns, rows ^ columns], axis=-1).astype(np.uint8)
         return hashlib.sha256(encode(picture, RenderConfig())).hexdigest()[:16]
 
 
 def _first_frames(renderer: Renderer, trajectory: Trajectory, case: str, listed: str) -> dict[str, Frame]:
-    """``<case> <camera>`` to the frame, with the perturbations that are ``listed`` as JSON."""
+    """Render ``<case> <camera>`` to the first frame, with the perturbations in ``listed``, a JSON text."""
     perturbations = from_json(listed)
     frames: dict[str, Frame] = {}
     with renderer.perturbed(of_layer(perturbations, RenderPerturbation)):
@@ -110,7 +113,7 @@ def _first_frames(renderer: Renderer, trajectory: Trajectory, case: str, listed:
 
 
 def thumbnail(frame: Frame) -> Floats:
-    """(CELLS, CELLS) mean grey levels of a frame."""
+    """Return the mean grey levels of a frame's cells (CELLS, CELLS)."""
     height, width, _ = frame.shape
     cells: Floats = frame.reshape(CELLS, height // CELLS, CELLS, width // CELLS, 3).mean(axis=(1, 3, 4))
     return cells
@@ -125,26 +128,26 @@ def _digest(trajectory: Trajectory) -> str:
 
 
 def recorded() -> dict[str, Any]:
-    """The file: cases, and for each step its recipe number to the results."""
+    """Read the file: cases, and for each step its recipe number to the results."""
     content: dict[str, Any] = json.loads(FILE.read_text())
     return content
 
 
 def main() -> None:
-    import golden_stages  # which needs no renderer, and imports much
+    import golden_stages  # here, as it needs no renderer and imports many modules
 
     gl.choose()
     content = recorded()
     golden, device = Golden(content["cases"]), gl.choose().device
     number = {step: str(recipe) for step, recipe in identity.RECIPES.items()}
     pixels = content["pixels"].setdefault(number["pixels"], {"thumbnails": golden.thumbnails(), "devices": {}})
-    for known, key, result, layer in (
+    for results, key, result, layer in (
         (content["physics"], number["physics"], golden.physics(), "physics"),
         (pixels["devices"], device, golden.pixels(), "pixels"),
         (content["encoding"], number["encoding"], golden.encoding(), "encoding"),
         *((content.setdefault(step, {}), number[step], make(), step) for step, make in golden_stages.STEPS.items()),
     ):
-        if known.setdefault(key, result) != result:
+        if results.setdefault(key, result) != result:
             sys.exit(f"{layer} has changed and its number has not: raise pipeline.identity.RECIPES[{layer!r}]")
     FILE.write_text(json.dumps(content, indent=1) + "\n")
 

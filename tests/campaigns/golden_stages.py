@@ -1,10 +1,11 @@
-"""What stages behind the frames make of a few small inputs: see ``golden.py``, which records it."""
+"""Outputs of the stages after rendering for a few small inputs; ``golden.py`` records them."""
 
 import hashlib
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,35 +34,42 @@ TEMPLATES = ("report.html.j2", "macros.html.j2", "style.css")
 
 
 def rlds() -> str:
-    """All files of a set of six synthetic episodes."""
+    """Return the digest of all files of a dataset of six synthetic episodes."""
     return _written(write_rlds)
 
 
 def lerobot() -> str:
-    """All files of two sets, what videos are of and how; their encoder may choose its code by the processor."""
+    """Return the digest of all files of two datasets; for videos, of their input and settings.
+
+    A video's bytes are left out, as its encoder may choose its code by the processor.
+    """
     return digest(_written(write_lerobot), _written(partial(write_lerobot, frames="images")), _encoded())[:16]
 
 
 def lerobot_v21() -> str:
-    """The same of a set of each convention."""
+    """Return the digest of a v2.1 dataset of each convention, in the same way as ``lerobot``."""
     written = (_written(partial(write_lerobot_v21, convention=each)) for each in ("ipec", "openpi"))
     return digest(*written, _encoded())[:16]
 
 
 def _encoded() -> str:
-    shown = planes(decode(episode(IDS[0]).frames["image"][0]))
-    return digest(hashlib.sha256(shown.tobytes()).hexdigest(), ENCODER, OPTIONS)
+    first_frame = planes(decode(episode(IDS[0]).frames["image"][0]))
+    return digest(hashlib.sha256(first_frame.tobytes()).hexdigest(), ENCODER, OPTIONS)
 
 
 def _written(write: Callable[[Path], Any]) -> str:
     with tempfile.TemporaryDirectory() as folder:
         target = write(Path(folder))
-        made = {name: content for name, content in files(target.folder).items() if not name.endswith(".mp4")}
-    return digest({name: hashlib.sha256(content).hexdigest() for name, content in made.items()})[:16]
+        contents = files(target.folder)
+    checksums: dict[str, str] = {}
+    for name, content in contents.items():
+        if not name.endswith(".mp4"):
+            checksums[name] = hashlib.sha256(content).hexdigest()
+    return digest(checksums)[:16]
 
 
 def evaluation() -> dict[str, Any]:
-    """How long episodes may last, and what one is told and observes at its start and after three steps."""
+    """Return the step limits, and an episode's instruction and observed states at its start and in three steps."""
     (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
     environment = EpisodeEnvironment()
     environment.reset(task)
@@ -70,13 +78,13 @@ def evaluation() -> dict[str, Any]:
         environment.step([0.5, -0.5, 0.5, 0.1, 0.0, 0.0, 1.0])
         seen.append(environment.observation(Wanted(images=False)))
     environment.close()
-    states = [np.round(one["states"].astype(float), 5).tolist() for one in seen]
-    told = {one["task_description"] for one in seen}
-    return {"step limits": dict(STEP_LIMITS), "told": sorted(told), "states": states}
+    states = [np.round(observation["states"].astype(float), 5).tolist() for observation in seen]
+    instructions = {observation["task_description"] for observation in seen}
+    return {"step limits": dict(STEP_LIMITS), "told": sorted(instructions), "states": states}
 
 
 def checks() -> dict[str, Any]:
-    """Each check to how many faults it finds in a whole copy of an episode, and in one where much is wrong."""
+    """Return the limits of the checks, and each check to its number of faults in one correct and two faulty copies."""
     made = episode(IDS[0])
     steps = len(made)
     states = np.zeros((steps + 1, 10))
@@ -90,11 +98,13 @@ def checks() -> dict[str, Any]:
     )
     row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
     row |= {"kept": True, "steps": steps + 1, "place": 1, "instruction": "task_1"}
-    view, other = SCHEMA.views
-    shown = {(name, t): decode(made.frames[name][t]) for name in SCHEMA.views for t in sampled(steps)}
+    view, second_view = SCHEMA.views
+    decoded = {(name, t): decode(made.frames[name][t]) for name, t in product(SCHEMA.views, sampled(steps))}
+    swapped = {(view, t): decoded[second_view, t] for t in sampled(steps)}
+    negated = {name: replace(seen, intrinsics=-seen.intrinsics) for name, seen in made.geometry.items()}
     marks = {"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz}
     stored = replace(made, instruction="task_1", provenance={name: row[name] for name in SCHEMA.provenance})
-    whole = Copy("whole", stored, ["task_1"] * steps, shown, marks, {"place": 1})
+    whole = Copy("whole", stored, ["task_1"] * steps, decoded, marks, {"place": 1})
     wrong = Copy(
         dataset="wrong",
         episode=replace(
@@ -102,10 +112,10 @@ def checks() -> dict[str, Any]:
             action=made.action + np.float32(0.01),
             provenance={},
             frames={},
-            geometry={name: replace(seen, intrinsics=-seen.intrinsics) for name, seen in made.geometry.items()},
+            geometry=negated,
         ),
         instructions=["something else"] * steps,
-        decoded={**shown, **{(view, t): shown[other, t] for t in sampled(steps)}},
+        decoded={**decoded, **swapped},
         marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
         place={"place": 2},
         said=[[{"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1"}]] * steps,
@@ -115,25 +125,25 @@ def checks() -> dict[str, Any]:
             {view: view},
         ),
     )
-    blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in shown.items()})
+    blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in decoded.items()})
     case = Case(row, made, trajectory, [whole, wrong, blank], None)
-    found = {name: len(list(check(case))) for name, check in of_episodes.CHECKS.items()}
+    faults = {name: len(list(check(case))) for name, check in of_episodes.CHECKS.items()}
     limits = {name: value for name, value in vars(of_episodes).items() if isinstance(value, float)}
     limits |= {"fresh PSNR dB": rerender.PSNR_DB, "mean levels": MEAN_LEVELS, "deviation": DEVIATION}
-    return {"found": found, "limits": limits}
+    return {"found": faults, "limits": limits}
 
 
 def pictures() -> dict[str, str]:
-    """A contact sheet, a plot, and the templates of the report."""
+    """Return digests of a contact sheet, a selection of episodes, a plot, and the templates of the report."""
     frames = [decode(episode(IDS[0]).frames[view][0]) for view in SCHEMA.views]
-    drawn = sheet("title", [Tile(side_by_side(frames, 64), f"caption {number}") for number in range(5)])
+    contact_sheet = sheet("title", [Tile(side_by_side(frames, 64), f"caption {number}") for number in range(5)])
     plot = figures.histogram("title", {"camera": np.linspace(-1, 1, 50)}, np.linspace(-1, 1, 11), "action", log=True)
     rows: list[Mapping[str, Any]] = [
         {"component": n % 2, "suite": n // 10, "level": n % 5, "task": n // 4} for n in range(40)
     ]
     folder = Path(figures.__file__).parent / "templates"
     return {
-        "sheet": hashlib.sha256(np.asarray(drawn).tobytes()).hexdigest()[:16],
+        "sheet": hashlib.sha256(np.asarray(contact_sheet).tobytes()).hexdigest()[:16],
         "spread": digest([rows.index(row) for row in spread(rows, 16)])[:16],
         "plot": digest(str(plot))[:16],
         "templates": digest([(folder / name).read_text() for name in TEMPLATES])[:16],
@@ -143,4 +153,4 @@ def pictures() -> dict[str, str]:
 STEPS: dict[Any, Callable[[], Any]] = {
     step.__name__: step for step in (rlds, lerobot, lerobot_v21, evaluation, checks, pictures)
 }
-"""Step of ``pipeline.identity.RECIPES`` to what it makes, JSON-serialisable."""
+"""Step of ``pipeline.identity.RECIPES`` to the function that returns its output, JSON-serialisable."""

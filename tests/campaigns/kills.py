@@ -1,11 +1,11 @@
-"""Kills a run at pseudo-random moments, and asks whether it ends like one that was left alone.
+"""Campaign that kills a run at pseudo-random moments, and compares its end with that of an undisturbed run.
 
     python tests/campaigns/kills.py [--kills 50] [--seed 0]
 
-Two folders get the same configuration. In one `dvc repro` runs undisturbed. In the other it is killed by SIGKILL again
-and again, every stage as often as any other and after a time that is drawn: everything at once, the stage's process
-alone, or one of its workers, which the run has to survive. In the end both must hold the same files with the same
-bytes, and no file that was whole at a kill may have been made again. The last line is JSON.
+Two folders get the same configuration. In the first folder, `dvc repro` runs undisturbed. In the second folder, SIGKILL
+kills it repeatedly, all stages equally often and after a sampled time. The victim is everything at once, the stage's
+process alone, or one of its workers; the run must survive the death of a worker. In the end both folders must hold the
+same files with the same bytes. No file that was complete at a kill may be generated again. The last line is JSON.
 """
 
 import argparse
@@ -34,9 +34,9 @@ import psutil
 from conftest import IN_SCRIPTS, SCRIPTS, dvc, in_a_clone
 
 SURVIVES_S = 20.0
-"""So long a run whose worker was killed goes on before it is killed as well."""
+"""Time that a run continues after the death of a worker, before it is killed as well."""
 ALONE_S = 60.0
-"""So long processes may live on after what started them was killed."""
+"""Time that processes may outlive their killed parent."""
 
 Victim = Literal["everything", "stage", "worker"]
 
@@ -53,13 +53,13 @@ STARTER: dict[str, object] = {
 
 @dataclass
 class Killed:
-    """What became of the kills.
+    """Results of the kills.
 
     Attributes:
-        kills: victim, and the stage that ran, to how often.
-        runs: how often the run came to its end and was begun again, as there were kills left.
-        locks: how often DVC was killed while it wrote a lock file, and refused to start until the file was deleted.
-        faults: what should not be.
+        kills: victim and running stage to the number of kills.
+        runs: number of runs that ended and were started again, as kills were left.
+        locks: number of lock files that a killed DVC left broken; DVC refuses to start until they are deleted.
+        faults: descriptions of the faults.
     """
 
     kills: Counter[str] = field(default_factory=Counter)
@@ -69,11 +69,14 @@ class Killed:
 
 
 def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float], target: str = "") -> Killed:
-    """Kill the run of a clone so often, then let it end.
+    """Kill the run of a clone ``kills`` times, then let it end.
 
     Args:
-        took_s: how long each stage takes that is to be killed; the moment is drawn from that time.
-        target: the last stage that is run (default: all are).
+        clone: the folder of the run.
+        kills: number of kills.
+        seed: seed of victims and moments.
+        took_s: duration of each stage that is to be killed; the moment is sampled from it.
+        target: the last stage to run (default: all stages run).
     """
     rng, result = random.Random(seed), Killed()
     whole: dict[Path, int] = {}
@@ -93,7 +96,7 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
             if run.returncode:
                 result.faults.append(f"the run ended with {run.returncode}")
                 return result
-            # DVC's own cache too, or it would take the reports from there.
+            # DVC's own cache too; else DVC would restore the reports from it.
             for folder in (clone / "data" / "tiny", clone / ".dvc" / "cache"):
                 shutil.rmtree(folder, ignore_errors=True)
             whole, due = {}, set()
@@ -118,7 +121,7 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
 
 
 def _without_broken_locks(clone: Path) -> int:
-    """Delete DVC's two lock files where DVC cannot read them, as setup.sh does; how many of them that was."""
+    """Delete those of DVC's two lock files that DVC cannot read, as setup.sh does; return their number."""
     broken = [] if dvc(clone, "stage", "list").returncode == 0 else [clone / "dvc.lock"]
     with suppress(FileNotFoundError):
         users = clone / ".dvc" / "tmp" / "rwlock"
@@ -144,7 +147,7 @@ def _wait(run: subprocess.Popen[bytes], seconds: float) -> None:
 
 
 def _stages(run: subprocess.Popen[bytes]) -> Iterator[str]:
-    """The name of each stage that works, once it has begun, until the run ends."""
+    """Yield the name of each stage when it starts, until the run ends."""
     last = ""
     while run.poll() is None:
         name = next((name for name, _ in _working(run)), "")
@@ -155,32 +158,40 @@ def _stages(run: subprocess.Popen[bytes]) -> Iterator[str]:
 
 
 def _working(run: subprocess.Popen[bytes]) -> list[tuple[str, psutil.Process]]:
-    """The stage that works, and its process."""
+    """Return the running stage and its process."""
     with suppress(psutil.Error):
-        below = [(_command(process), process) for process in psutil.Process(run.pid).children(recursive=True)]
-        return [(Path(words[1]).stem, each) for words, each in below if words[1:] and words[1].startswith("stages/")]
+        working: list[tuple[str, psutil.Process]] = []
+        for process in psutil.Process(run.pid).children(recursive=True):
+            words = _command(process)
+            if words[1:] and words[1].startswith("stages/"):
+                working.append((Path(words[1]).stem, process))
+        return working
     return []
 
 
 def watched(run: subprocess.Popen[bytes]) -> dict[str, float]:
-    """How many seconds each stage of a run takes that is left alone."""
+    """Measure the seconds of each stage of an undisturbed run."""
     began = {name: time.monotonic() for name in _stages(run)}
     ended = [*began.values(), time.monotonic()][1:]
     return {name: end - start for (name, start), end in zip(began.items(), ended, strict=True)}
 
 
 def _kill(run: subprocess.Popen[bytes], victim: Victim) -> str:
-    """Kill a victim, or everything where there is no such one at the moment; says what, and in which stage."""
+    """Kill the victim, or everything if there is no such process; return the killed victim and the stage."""
     working = _working(run)
     stage = working[0][0] if working else "dvc"
     below = psutil.Process(run.pid).children(recursive=True)
-    workers = [process for process in below if any("spawn_main" in word for word in _command(process))]
+    workers = [process for process in below if _is_worker(process)]
     chosen = {"everything": [], "stage": [process for _, process in working], "worker": workers}[victim]
     if not chosen:
         os.killpg(run.pid, signal.SIGKILL)
         return f"everything in {stage}"
     chosen[-1].kill()
     return f"{victim} in {stage}"
+
+
+def _is_worker(process: psutil.Process) -> bool:
+    return any("spawn_main" in word for word in _command(process))
 
 
 def _command(process: psutil.Process) -> list[str]:
@@ -192,7 +203,7 @@ def _command(process: psutil.Process) -> list[str]:
 
 
 def _end(run: subprocess.Popen[bytes]) -> list[str]:
-    """Wait until no process of the run is left, or kill it where it still runs after the death of a worker."""
+    """Kill the run if it still runs, and wait until all of its processes have ended; return the faults."""
     if run.poll() is None and _alive(run.pid):
         os.killpg(run.pid, signal.SIGKILL)
     run.wait()
@@ -222,25 +233,29 @@ def _stored(clone: Path) -> Iterator[Path]:
 
 
 def contents(clone: Path) -> dict[str, str]:
-    """Every file of a clone, but for DVC's own records and the machine's speed."""
-    files = (file for file in clone.rglob("*") if file.is_file() and not file.is_symlink())
-    return {
-        path: hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in files
-        if not (path := file.relative_to(clone).as_posix()).startswith((".dvc/", ".git/"))
-        and "__pycache__" not in path
-        and file.name != "speed.json"
-    }
+    """Return path to SHA-256 of every file of a clone, except DVC's own records and the machine's speed."""
+    checksums: dict[str, str] = {}
+    for file in clone.rglob("*"):
+        if not file.is_file() or file.is_symlink() or file.name == "speed.json":
+            continue
+        path = file.relative_to(clone).as_posix()
+        if not path.startswith((".dvc/", ".git/")) and "__pycache__" not in path:
+            checksums[path] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return checksums
 
 
 def compared(undisturbed: Path, disturbed: Path) -> list[str]:
-    """What differs between the files of two clones."""
-    one, other = contents(undisturbed), contents(disturbed)
-    return [
-        f"{path} is {'missing' if path not in other else 'left over' if path not in one else 'another'}"
-        for path in sorted(one.keys() | other.keys())
-        if one.get(path) != other.get(path)
-    ]
+    """List the differences between the files of two clones."""
+    expected, actual = contents(undisturbed), contents(disturbed)
+    differences: list[str] = []
+    for path in sorted(expected.keys() | actual.keys()):
+        if path not in actual:
+            differences.append(f"{path} is missing")
+        elif path not in expected:
+            differences.append(f"{path} is left over")
+        elif expected[path] != actual[path]:
+            differences.append(f"{path} is another")
+    return differences
 
 
 def main() -> None:

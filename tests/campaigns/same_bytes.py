@@ -1,9 +1,9 @@
-"""Makes one configuration with no worker process, with 1, 2 and 4, and with 2 again, and compares all that they wrote.
+"""Comparison of one configuration's outputs with no worker process, with 1, 2 and 4 workers, and with 2 again.
 
     python tests/campaigns/same_bytes.py
 
-Each run is a `dvc repro` in a folder of its own, on the tests' short demonstrations. Of their files only the
-configuration may differ. The last line is JSON.
+Each run is a `dvc repro` in a separate folder, on the tests' short demonstrations. Only the configuration may differ
+between their files. The last line is JSON.
 """
 
 import json
@@ -27,7 +27,7 @@ COMPUTE: dict[str, dict[str, object]] = {
     "four": {"cluster": "local", "workers": 4},
     "none": {"cluster": "loop"},
 }
-"""The first is what the others are compared with."""
+"""Run to its section ``compute``; all runs are compared with the first."""
 
 AXES = ("camera", "light", "noise", "language", "layout")
 
@@ -53,9 +53,9 @@ def main() -> None:
             if done.returncode:
                 raise SystemExit(done.stdout + done.stderr)
             seconds[name] = round(time.monotonic() - start, 1)
-            found = [line for line in compared(first, clone) if line != "configs/tiny.yaml is another"]
-            different[name] = found
-            print(f"{name}: {seconds[name]} s, {len(found)} files differ", *found, sep="\n  ")
+            differences = [line for line in compared(first, clone) if line != "configs/tiny.yaml is another"]
+            different[name] = differences
+            print(f"{name}: {seconds[name]} s, {len(differences)} files differ", *differences, sep="\n  ")
         files = sum(1 for file in (first / "data" / "tiny").rglob("*") if file.is_file())
     faults = sum(map(len, different.values()))
     print(json.dumps({"files": files, "seconds": seconds, "files_that_differ": faults}))

@@ -1,12 +1,11 @@
-"""Runs every stage where its surroundings fail it: on a full disk, a read-only one, without a network, and by a clock
-that goes back.
+"""Campaign that runs every stage in failing surroundings: full or read-only disk, no network, a clock set back.
 
     sudo python tests/campaigns/surroundings.py        # mounts a small file system, and takes the network away
 
-Two folders get the same configuration. In one, every stage runs without a network. In the other, the data folder is a
-file system that cannot be written to before each stage, and then grows each time that it is full. A stage that cannot
-go on must say so in words and end with 1; in the end both folders must hold the same bytes. Then all files are dated a
-day ahead, and no stage may make one of them again. The last line is JSON.
+Two folders get the same configuration. In the first folder, every stage runs without a network. In the second folder,
+the data folder is a file system of its own. It is read-only before each stage, and then grows each time that it is
+full. A stage that cannot continue must report the reason and end with 1. In the end both folders must hold the same
+bytes. Then all files are dated a day ahead, and no stage may generate them again. The last line is JSON.
 """
 
 import argparse
@@ -30,7 +29,7 @@ from conftest import IN_SCRIPTS, STAGES, in_a_clone
 from kills import STARTER, compared
 
 FIRST_KB, MORE_KB = 64, 1500
-"""How large the file system is at first, and by how much it grows."""
+"""Initial size of the file system, and its growth each time that it is full."""
 
 DAY_S = 86_400
 
@@ -57,7 +56,8 @@ def main() -> None:
                 refused["read_only"] += 1
                 remount(disk, "rw")
                 while (done := stage(disturbed, name)).returncode:
-                    if unlike := unlike_a_message(name, done, "disk is full"):
+                    unlike = unlike_a_message(name, done, "disk is full")
+                    if unlike:
                         raise SystemExit("\n".join([*faults, *unlike]))
                     refused[f"full_in_{name}"] += 1
                     grow(disk)
@@ -76,7 +76,7 @@ def stage(clone: Path, name: str, *prefix: str) -> subprocess.CompletedProcess[s
 
 
 def unlike_a_message(name: str, done: subprocess.CompletedProcess[str], expected: str) -> list[str]:
-    """What is wrong with how a stage ended; nothing where it said why in words."""
+    """Return the fault of a stage's ending; an empty list if the stage reported the expected reason."""
     message = done.stderr.strip()
     if done.returncode == 1 and expected in message and "Traceback" not in message and "try:" in message:
         return []
@@ -103,7 +103,7 @@ def remount(disk: Path, option: str) -> None:
 
 
 def remade_by_another_clock(clone: Path) -> list[str]:
-    """Date all files ahead, as if they had been made before the clock was set back, and run all stages again."""
+    """Date all files ahead, as if the clock had been set back since, and run all stages again; return the faults."""
     files = [file for file in (clone / "data" / "tiny").rglob("*.npz") if file.is_file()]
     ahead_s = time.time() + DAY_S
     for file in files:

@@ -1,4 +1,4 @@
-"""The recipe of a run of two suites, as far as it is made from the manifest."""
+"""Recipe of a run of two suites, limited to the parts that depend on the manifest."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""What workers are given to do, in a module that they import quickly."""
+"""Functions for workers, in a module that imports quickly."""
 
 import os
 import resource
@@ -16,7 +16,7 @@ def square(number: int) -> int:
 
 
 def process(_: int) -> int:
-    time.sleep(0.1)  # or one worker may do all before the other is asked
+    time.sleep(0.1)  # else one worker may finish all items before the second worker starts
     return os.getpid()
 
 
@@ -49,7 +49,7 @@ def mark(file: Path) -> None:
 
 
 def pages_asked_for(times: int) -> int:
-    """So many pages the system had to give, while a block of memory was taken, filled and freed again and again."""
+    """Count the memory pages that the system provides while a block is allocated, filled and freed ``times`` times."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(times):
         b"x" * BLOCK_BYTES

@@ -1,4 +1,4 @@
-"""Six synthetic episodes as RLDS, as LeRobot with videos and with images, and what lerobot must hand out of them."""
+"""Six synthetic episodes as RLDS, as LeRobot with videos and with images, and the samples that lerobot must return."""
 
 import socket
 from collections.abc import Callable, Iterator, Sequence
@@ -41,7 +41,7 @@ class Written:
 
     @property
     def version(self) -> Path:
-        """The version folder of the RLDS set."""
+        """Return the version folder of the RLDS set."""
         return self.rlds.folder / SET / "1.0.0"
 
 
@@ -61,7 +61,7 @@ def write_all(out: Path, run: Any = loop) -> Written:
 
 
 def write_offline(folder: Path) -> None:
-    """Without a network and without a trace in the cache of ``datasets``."""
+    """Write all sets without a network and without a trace in the cache of ``datasets``."""
 
     def refuse(*_: object) -> None:
         raise AssertionError("a writer reached for the network")
@@ -77,7 +77,7 @@ def write_offline(folder: Path) -> None:
 
 @contextmanager
 def every_set(once: Once, cache: Path) -> Iterator[Written]:
-    """The sets that all modules share; ``datasets`` reads them through a cache of their own."""
+    """Yield the sets that all modules share; ``datasets`` reads them through a separate cache."""
     out = once("every_set", write_offline) / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
@@ -95,7 +95,7 @@ def lerobot_index(target: LeRobot) -> dict[str, int]:
 
 
 def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
-    """What lerobot must hand out; frames the very pixels of the stored ones, or within ``MIN_PSNR_DB``."""
+    """Assert that lerobot returns the episodes; frames are equal if ``exact``, else within ``MIN_PSNR_DB``."""
     dataset = LeRobotDataset(REPO, root=folder, video_backend="pyav")
     assert (dataset.num_episodes, dataset.fps, dataset.meta.robot_type) == (len(IDS), 20, "panda")
     assert dataset.num_frames == sum(len(episode(episode_id)) for episode_id in IDS)
@@ -112,8 +112,8 @@ def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
             np.testing.assert_array_equal(np.stack([item[name] for item in items]), getattr(source, key))
         for key, view in (("image", "image"), ("image2", "wrist_image")):
             decoded = [item[f"observation.images.{key}"].numpy().transpose(1, 2, 0) * 255 for item in items]
-            for shown, frame in zip(decoded, source.frames[view], strict=True):
+            for decoded_frame, frame in zip(decoded, source.frames[view], strict=True):
                 if exact:
-                    np.testing.assert_array_equal(shown, pixels(frame))
+                    np.testing.assert_array_equal(decoded_frame, pixels(frame))
                 else:
-                    assert psnr_db(shown, pixels(frame)) > MIN_PSNR_DB
+                    assert psnr_db(decoded_frame, pixels(frame)) > MIN_PSNR_DB

@@ -1,4 +1,4 @@
-"""A file of demonstrations as LIBERO publishes it, of a scene that was recorded on somebody else's machine."""
+"""File of demonstrations as LIBERO publishes it, with a scene that was recorded on another machine."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ from pipeline.types import Task
 TASK = find_task("libero_goal", "turn_on_the_stove")
 NAME = f"{TASK.suite}/{TASK.name}"
 
-# Where the scenes of the published set were recorded, but for the author's name.
+# Asset folders in the scenes of the published dataset, without the author's name.
 LIBERO = "/home/author/workspace/libero-dev/chiliocosm/assets"
 ROBOSUITE = "/Users/author/workspace/robosuite-master/robosuite/models/assets"
 
@@ -42,12 +42,12 @@ def write_scene(folder: Path) -> None:
 
 
 def scene_here(once: Once) -> str:
-    """A real scene of LIBERO's, with the asset paths of this machine."""
+    """Return a real scene of LIBERO, with the asset paths of this machine."""
     return (once("stove_scene", write_scene) / "scene.xml").read_text()
 
 
 def as_published(scene: str) -> str:
-    """The scene as the published files hold it: somebody else's paths, one of them roundabout."""
+    """Convert a scene to that of the published files: asset paths of another machine, one of them with ``..``."""
     libero, robosuite = assets._roots()["/libero/assets/"], assets._roots()["/robosuite/models/assets/"]
     foreign = scene.replace(str(libero), LIBERO).replace(str(robosuite), ROBOSUITE)
     return foreign.replace(f"{LIBERO}/textures/", f"{LIBERO}/scenes/../textures/", 1)
@@ -67,7 +67,7 @@ def recording(model_file: str, steps: int = 12, seed: int = 0) -> hdf5.Recording
 
 
 def write_eleven(root: Path, model_file: str) -> Path:
-    """A published file's layout with 11 demonstrations of one task."""
+    """Write 11 demonstrations of one task in a published file's layout."""
     hdf5.write(file_in(root), TASK, (recording(model_file, seed=seed) for seed in range(11)))
     return root
 

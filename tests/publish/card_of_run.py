@@ -1,4 +1,4 @@
-"""The files of a run as far as its card reads them, and the card that is written from them."""
+"""Files of a run that its card reads, and the card that is written from them."""
 
 import hashlib
 import json
@@ -75,14 +75,14 @@ VALIDATION: dict[str, dict[str, Any]] = {"gripper": {"checked": 7, "findings": [
 
 
 def write_files(data: Path) -> None:
-    """Into the folder of a run, what the card reads."""
+    """Write the files that the card reads into the folder of a run."""
     write_rows(data, ROWS)
     column = list(range(1, 8))
     for name, report in {
         "leakage.json": {
             "camera": FINDING
             | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint", "coverage": {"distance": COVERAGE}},
-            # Of the plan, and of no episode that is kept.
+            # An axis of the plan without kept episodes.
             "robot": FINDING | {"measure": "radians", "overlaps": 0, "verdict": "disjoint", "coverage": {}},
         },
         "validation.json": VALIDATION,
@@ -144,8 +144,8 @@ def metadata_of(text: str) -> dict[str, Any]:
 
 
 def cells(text: str, first: str, under: str) -> list[str]:
-    """The row that begins with ``first`` in the section ``under``."""
+    """Return the cells of the row that begins with ``first`` in the section ``under``."""
     section = text.partition(f"## {under}\n")[2]
-    found = re.search(rf"^\| {re.escape(first)} \|(.*)\|$", section, re.MULTILINE)
-    assert found, f"no {first} under {under}"
-    return [cell.strip() for cell in found[1].split(" | ")]
+    row_match = re.search(rf"^\| {re.escape(first)} \|(.*)\|$", section, re.MULTILINE)
+    assert row_match, f"no {first} under {under}"
+    return [cell.strip() for cell in row_match[1].split(" | ")]

@@ -1,4 +1,4 @@
-"""A server on this machine that speaks as much of the hub's protocol as an upload needs."""
+"""Local server with the part of the hub's protocol that an upload needs."""
 
 import base64
 import hashlib
@@ -12,25 +12,25 @@ from typing import Any
 
 REPOSITORY = "somebody/tiny"
 ATTRIBUTES = b"*.parquet filter=lfs diff=lfs merge=lfs -text\n"
-"""Of the file .gitattributes, with which the hub creates a repository."""
+"""Content of the file .gitattributes in a new repository of the hub."""
 LARGE = (".parquet", ".mp4", ".png")
 
 
 class Hub:
-    """What the server has and does.
+    """State and behaviour of the server.
 
     Attributes:
-        files: path in the repository to content, once committed.
-        private: of the repository, None until it is made.
+        files: path in the repository to committed content.
+        private: visibility of the repository, ``None`` before its creation.
         tags: name to the number of the commit.
-        commits: how many there were.
-        objects: large content that arrived, by SHA-256, committed or not.
-        sent: SHA-256 of every object that was sent whole.
-        cuts: how many more transfers of an object break off half way.
-        allowed: how many transfers go well before that.
-        before_transfer: called before it says how a file is to be sent, as what happens here meanwhile.
-        before_commit: called before a commit is looked at, as what others do meanwhile.
-        failing: how many more commits are answered with an error of the server.
+        commits: number of commits.
+        objects: received large content, by SHA-256, committed or not.
+        sent: SHA-256 of every completely sent object.
+        cuts: number of further transfers of an object that break off half way.
+        allowed: number of successful transfers before these.
+        before_transfer: called before the answer about the transfer of files; simulates a simultaneous local event.
+        before_commit: called before a commit is checked; simulates a simultaneous commit by another client.
+        failing: number of further commits that are answered with a server error.
     """
 
     def __init__(self) -> None:
@@ -76,9 +76,11 @@ class Hub:
                     self._answer(404 if token else 401, {"error": "Repository not found"}, "RepoNotFound")
                     return
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                request = f"{method} {self.path.partition('?')[0]}"
                 for pattern, answer in ROUTES.items():
-                    if found := re.fullmatch(pattern, f"{method} {self.path.partition('?')[0]}"):
-                        status, content = answer(hub, body, *found.groups())
+                    route_match = re.fullmatch(pattern, request)
+                    if route_match:
+                        status, content = answer(hub, body, *route_match.groups())
                         self._answer(status, content)
                         return
                 self._answer(404, {"error": f"{method} {self.path}"})
@@ -127,7 +129,7 @@ class Hub:
         return 200, answer
 
     def head(self) -> str:
-        """The last commit."""
+        """Return the id of the last commit."""
         return f"{self.commits:040x}"
 
     def whoami(self, body: bytes) -> tuple[int, object]:
@@ -136,7 +138,10 @@ class Hub:
     def tree(self, body: bytes, revision: str) -> tuple[int, object]:
         if revision not in ("main", self.head()):
             return 404, {"error": "no such revision"}
-        folders = {str(parent) for path in self.files for parent in PurePosixPath(path).parents} - {"."}
+        folders: set[str] = set()
+        for path in self.files:
+            folders |= {str(parent) for parent in PurePosixPath(path).parents}
+        folders -= {"."}
         listed = [{"type": "directory", "path": folder, "size": 0, "oid": "0" * 40} for folder in sorted(folders)]
         return 200, listed + [self._entry(path, content) for path, content in self.files.items()]
 
@@ -170,9 +175,9 @@ class Hub:
 
     def batch(self, body: bytes) -> tuple[int, object]:
         wanted = json.loads(body)["objects"]
-        for one in wanted:
-            if one["oid"] not in self.objects:
-                one["actions"] = {"upload": {"href": f"{self.endpoint}/objects/{one['oid']}"}}
+        for entry in wanted:
+            if entry["oid"] not in self.objects:
+                entry["actions"] = {"upload": {"href": f"{self.endpoint}/objects/{entry['oid']}"}}
         return 200, {"objects": wanted}
 
     def commit(self, body: bytes) -> tuple[int, object]:
@@ -183,7 +188,8 @@ class Hub:
         operations = [json.loads(line) for line in body.splitlines()]
         if operations[0]["value"].get("parentCommit", self.head()) != self.head():
             return 412, {"error": "A commit has happened since. Please refresh and try again."}
-        if any(one["key"] == "lfsFile" and one["value"]["oid"] not in self.objects for one in operations):
+        pointers = [operation["value"]["oid"] for operation in operations if operation["key"] == "lfsFile"]
+        if any(oid not in self.objects for oid in pointers):
             return 400, {"error": "LFS pointer pointed to a file that does not exist"}
         for operation in operations:
             value = operation["value"]
@@ -211,7 +217,7 @@ class Hub:
 
 
 def is_large(path: str) -> bool:
-    """Whether the hub keeps the file outside of git."""
+    """Check if the hub stores the file outside of git."""
     return path.endswith(LARGE) or "tfrecord" in path
 
 

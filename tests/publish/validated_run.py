@@ -1,4 +1,4 @@
-"""A run's folder with the datasets of six episodes, validated and with cards, to be uploaded."""
+"""Validated run folder with the datasets of six episodes and their cards, for uploads."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,7 @@ def prepare(data: Path, kind: str) -> Upload:
 
 
 def write_run(data: Path) -> None:
-    """In the order in which the stages write it."""
+    """Write the files of a run in the order in which the stages write them."""
     write_rlds(data)
     write_lerobot(data, name=NAME)
     write_lerobot_v21(data)

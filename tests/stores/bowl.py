@@ -1,4 +1,4 @@
-"""One demonstration of the bowl, cut short, and a plan of it: what the tests of the stores replay and render."""
+"""Shortened demonstration of the bowl and a plan of it, which the tests of the stores replay and render."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ def bowl_config(demos: Path) -> Config:
 
 
 def bowl_plan(config: Config) -> list[plan.Row]:
-    """A clean twin, a light episode and its reserve."""
+    """Plan a clean twin, a light episode and its reserve."""
     return plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
 
 
@@ -33,7 +33,10 @@ def replay_bowl(config: Config, folder: Path) -> None:
 
 
 def given_up(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
-    """What a cluster does with work that no worker survives; see tests/compute/test_compute.py for workers that die."""
+    """Give up all items, as a cluster does with work that no worker survives.
+
+    tests/compute/test_compute.py tests workers that die.
+    """
     return [fn.lost(item) for item in items]
 
 
