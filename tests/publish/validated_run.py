@@ -10,6 +10,7 @@ from synthetic import write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.files import checksum
+from pipeline.formats.registry import formats_of
 from pipeline.generated import generated
 from pipeline.publish import push
 from pipeline.publish.card import REPORTS
@@ -25,8 +26,7 @@ def prepare(data: Path, kind: str) -> Upload:
         lerobot=LeRobotConfig(name=NAME, shards=3),
         lerobot_v21=LeRobotV21Config(name="synthetic", convention="ipec"),
     )
-    run = run_in(data, export=options)
-    return push.prepare(run.dataset(kind), run)
+    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind), run_in(data))
 
 
 def write_run(data: Path) -> None:

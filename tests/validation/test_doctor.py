@@ -325,7 +325,7 @@ def test_a_run_is_not_gone_on_with_where_the_same_versions_compute_otherwise(tmp
     for name, store in cases.items():
         with pytest.raises(PipelineError, match=f"the run was begun where {name}, made by") as caught:
             machine.record(run, TRIAL | {name: "other"})
-        assert str(caught.value).endswith(f"delete {store}")
+        assert str(caught.value).endswith(f"move away {store}")
     machine.record(run, TRIAL | {"OpenGL device": "two", "one frame": "cdef"})
     machine.record(run, TRIAL)
 
