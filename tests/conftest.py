@@ -25,7 +25,7 @@ import yaml
 from filelock import FileLock
 
 from pipeline import M_MMAP_THRESHOLD
-from pipeline.config import ReplayConfig
+from pipeline.config import Config, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
@@ -39,6 +39,7 @@ from pipeline.types import Demo, Task, Trajectory
 
 if TYPE_CHECKING:  # the tests that render choose what renders
     from pipeline.rendering.renderer import LastScene, Renderer
+    from pipeline.run.run import Run
 
 Result = TypeVar("Result")
 
@@ -242,6 +243,19 @@ def limited(what: int, most: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(what, before)
+
+
+def run_in(folder: Path, **sections: Any) -> Run:
+    """Return the run of a folder, with the smallest configuration and other ``sections`` of it."""
+    from pipeline.run.run import Run
+
+    plan = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
+    return Run(Config.model_validate({"name": folder.name, "folder": folder.parent, "plan": plan, **sections}))
+
+
+def datasets_in(folder: Path) -> dict[str, Path]:
+    """Map each format to the folder of its dataset in a run's folder, as ``recipe.write`` takes them."""
+    return {name: folder / name for name in ("rlds", "lerobot", "lerobot_v21")}
 
 
 def link_testset(folder: Path) -> None:

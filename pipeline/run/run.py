@@ -49,17 +49,17 @@ class Run:
     when their file has changed. A stage or a command gets a ``Run`` of its own.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, folder: Path | None = None) -> None:
         self.config = config
-        self.folder = config.data
+        self.folder = folder or config.data
 
-    def __reduce__(self) -> tuple[type["Run"], tuple[Config]]:
-        """Send a worker the configuration alone; it opens what it needs."""
-        return Run, (self.config,)
+    def __reduce__(self) -> tuple[type["Run"], tuple[Config, Path]]:
+        """Send a worker the configuration and the folder alone; it opens what it needs."""
+        return Run, (self.config, self.folder)
 
     def resolved(self) -> "Run":
         """Return the same run with an absolute path, without links, for libraries that change or compare paths."""
-        return Run(self.config.model_copy(update={"folder": self.folder.resolve().parent}))
+        return Run(self.config, self.folder.resolve())
 
     def path(self, name: str) -> Path:
         """Return the path of a file or folder of the run, by one of the names of this module."""

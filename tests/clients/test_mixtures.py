@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from conftest import datasets_in
 from tiny_recipe import ROWS, export_config, row, tiny_recipe
 
 from pipeline.clients.recipe import write
@@ -46,5 +47,5 @@ def test_openvla_oft_counts_steps_that_it_does_not_train_on(split: str, about: b
 @pytest.mark.parametrize("export", [export_config(), ExportConfig(rlds=None)], ids=["with RLDS", "without"])
 def test_the_script_of_openvla_oft_is_there_with_rlds_alone(export: ExportConfig, tmp_path: Path) -> None:
     made = tiny_recipe(tmp_path, export)
-    write(made, tmp_path, export)
+    write(made, tmp_path / "finetune", export, datasets_in(tmp_path))
     assert (tmp_path / "finetune" / "run_openvla_oft.py").exists() == ("openvla_oft" in made["clients"])

@@ -79,6 +79,10 @@ def write(data: Path, load: Callable[[str], Episode] = episode) -> Path:
     return data
 
 
+def check_all(data: Path) -> dict[str, dict[str, Any]]:
+    return oft.check_all(data / "rlds", data / "dataset_statistics.json")
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("data"))
@@ -129,7 +133,7 @@ def test_normalising_clips_at_the_percentiles_and_flattens_constants() -> None:
 
 
 def test_check_finds_nothing_wrong(data: Path) -> None:
-    found = oft.check_run(data)[NAME]
+    found = check_all(data)[NAME]
     assert found.pop("clipped_share") < 0.1
     assert found == {
         "episodes": 3,
@@ -172,7 +176,7 @@ FAULTS: dict[str, Callable[[Episode], Episode]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_check_catches_a_bad_episode(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rlds_write, "check", lambda *_: None)
-    found = oft.check_run(write(tmp_path, partial(spoilt, FAULTS[fault])))[NAME]
+    found = check_all(write(tmp_path, partial(spoilt, FAULTS[fault])))[NAME]
     assert found["violations"][0].startswith(fault)
     assert (found["episodes"], found["passed_by"]) == (3, 1)
 
@@ -183,7 +187,7 @@ def turned(name: str) -> Episode:
 
 
 def test_check_catches_a_gripper_of_the_wrong_sign(tmp_path: Path) -> None:
-    (violation,) = oft.check_run(write(tmp_path, turned))[NAME]["violations"]
+    (violation,) = check_all(write(tmp_path, turned))[NAME]["violations"]
     assert "the command's sign is wrong" in violation
 
 
@@ -212,10 +216,10 @@ def test_damage_is_found(data: Path, tmp_path: Path) -> None:
 
 def test_errors_say_what_is_missing(data: Path, tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="no RLDS dataset"):
-        oft.check_run(tmp_path)
+        check_all(tmp_path)
     (tmp_path / "rlds").symlink_to(data / "rlds")
     with pytest.raises(PipelineError, match=r"dataset_statistics\.json: not there"):
-        oft.check_run(tmp_path)
+        check_all(tmp_path)
     (tmp_path / "dataset_statistics.json").write_text("{}")
-    (found,) = oft.check_run(tmp_path).values()
+    (found,) = check_all(tmp_path).values()
     assert found["violations"] == ["dataset_statistics.json has nothing on it"]

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import datasets_in
 
 from pipeline.clients.recipe import build, write
 from pipeline.clients.templates.run_openvla_oft import mixed
@@ -94,7 +95,8 @@ def trained(folder: Path, *words: str) -> tuple[dict[str, Any], dict[str, Any]]:
     ]
     (folder / "data" / "manifest.parquet").write_bytes(b"rows")
     export = ExportConfig(rlds=RldsConfig(name="libero_mine"), lerobot=None)
-    write(build(folder / "data" / "manifest.parquet", rows, export), folder / "data", export)
+    recipe = build(folder / "data" / "manifest.parquet", rows, export)
+    write(recipe, folder / "data" / "finetune", export, datasets_in(folder / "data"))
     checkout = folder / "oft"
     for name, text in STAND_INS.items():
         (checkout / name).parent.mkdir(parents=True, exist_ok=True)

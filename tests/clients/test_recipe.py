@@ -8,6 +8,7 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+from conftest import datasets_in
 from synthetic import IDS, SET, episode, write_lerobot_v21
 from tiny_recipe import NAME, ROWS, SUITES, export_config, row, tiny_recipe
 
@@ -77,7 +78,7 @@ def test_schema_refuses(section: str, field: str, value: object, tmp_path: Path)
 
 def test_written_recipe_is_read_back_and_its_commands_can_be_copied(tmp_path: Path) -> None:
     recipe = tiny_recipe(tmp_path)
-    write(recipe, tmp_path, export_config())
+    write(recipe, tmp_path / "finetune", export_config(), datasets_in(tmp_path))
     text = (tmp_path / "finetune" / "finetune.yaml").read_text()
     assert yaml.safe_load(text) == recipe
     assert all(client["command"] in text for client in recipe["clients"].values())
@@ -88,7 +89,7 @@ def test_openpi_finds_set_and_statistics_by_the_command_of_the_recipe(tmp_path: 
     target = write_lerobot_v21(tmp_path, "openpi")
     options = export_config(lerobot_v21=target.options)
     recipe = tiny_recipe(tmp_path, options)
-    write(recipe, tmp_path, options)
+    write(recipe, tmp_path / "finetune", options, datasets_in(tmp_path))
     command = recipe["clients"]["openpi"]["command"].replace("$DATA", str(tmp_path))
     given = dict(word.split("=") for word in command.split() if "=" in word)
     root = Path(given["HF_LEROBOT_HOME"], given["--data.repo-id"])
@@ -107,7 +108,7 @@ def test_starvla_finds_the_sets_of_every_suite(tmp_path: Path) -> None:
     target = write_lerobot_v21(tmp_path, "ipec")
     options = export_config(lerobot_v21=target.options)
     recipe = tiny_recipe(tmp_path, options)
-    write(recipe, tmp_path, options)
+    write(recipe, tmp_path / "finetune", options, datasets_in(tmp_path))
     (found,) = runpy.run_path(str(tmp_path / "finetune" / "starvla_data_config.py"))["DATASET_NAMED_MIXTURES"].items()
     assert found == ("synthetic", [(SET, 1.0, "libero_franka")])
     assert (tmp_path / "lerobot_v21" / SET / "meta" / "modality.json").is_file()

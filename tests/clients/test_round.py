@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from conftest import BOWL, SHORT, starter_demo
+from conftest import BOWL, SHORT, datasets_in, starter_demo
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -77,7 +77,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         export(target, Episodes(known, made.__getitem__), loop)
     statistics = exact_statistics.openvla([(one.action, one.state) for one in made.values()])
     (data / "dataset_statistics.json").write_text(json.dumps({SET: statistics}))
-    recipe.write({}, data, ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=v21))
+    options = ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=v21)
+    recipe.write({}, data / "finetune", options, datasets_in(data))
     return data
 
 

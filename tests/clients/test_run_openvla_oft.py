@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from conftest import datasets_in
 from tiny_recipe import NAME, SUITES, export_config, tiny_recipe
 
 from pipeline.clients.recipe import write
@@ -25,7 +26,7 @@ from pipeline.clients.recipe import write
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's data folder with what the recipe stage writes."""
     data = tmp_path_factory.mktemp("data")
-    write(tiny_recipe(data), data, export_config())
+    write(tiny_recipe(data), data / "finetune", export_config(), datasets_in(data))
     return data
 
 

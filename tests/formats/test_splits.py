@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import tensorflow_datasets as tfds
 import yaml
-from conftest import REPOSITORY, link_testset, tiny_config
+from conftest import REPOSITORY, datasets_in, link_testset, tiny_config
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
@@ -164,7 +164,7 @@ def test_lerobot_trains_without_what_is_held_out(
     (data / "manifest.parquet").touch()
     options = ExportConfig(rlds=None, lerobot=LeRobotConfig(name=NAME, shards=3, validation=0.34))
     made = recipe.build(data / "manifest.parquet", [], options)
-    recipe.write(made, data, options)
+    recipe.write(made, data / "finetune", options, datasets_in(data))
     commands = {name: client["command"].replace("$DATA", str(data)) for name, client in made["clients"].items()}
     assert len({shlex.split(command)[1] for command in commands.values()}) == 1
     monkeypatch.setattr(sys, "argv", shlex.split(commands["lerobot_act"]))
@@ -191,7 +191,8 @@ def test_what_is_held_out_of_v21_is_a_set_of_its_own(
         assert list(dict.fromkeys(row["episode_id"] for row in rows)) == ids
         assert [row["index"] for row in rows] == list(range(len(rows)))
     rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
-    recipe.write({}, tmp_path, ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=options))
+    formats = ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=options)
+    recipe.write({}, tmp_path / "finetune", formats, datasets_in(tmp_path))
     if convention == "openpi":
         found = json.loads((tmp_path / "finetune" / recipe.OPENPI_ASSETS).read_text())["norm_stats"]
         for key, column in (("actions", "action"), ("state", "state")):

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import pyarrow as pa
 import yaml
-from conftest import MILK, STOVE
+from conftest import MILK, STOVE, run_in
 from huggingface_hub import DatasetCard
 
 from pipeline.axes import to_json
@@ -19,12 +19,12 @@ from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
-from pipeline.formats.registry import FORMATS, columns, formats_of
+from pipeline.formats.registry import FORMATS, columns
 from pipeline.publish import card
 from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.seeding import rng
-from pipeline.types import Extra, Task
+from pipeline.types import RenderedExtra, Task
 
 NAME = "libero_tiny"
 CAMERA = CameraAxis(levels=(4,)).sample(rng("card"), MILK, 0)
@@ -122,17 +122,17 @@ OPTIONS = ExportConfig(
 def write(
     data: Path,
     options: ExportConfig = OPTIONS,
-    extras: Sequence[Extra] = (),
+    extras: Sequence[RenderedExtra] = (),
     publish: PublishConfig = NO_STATEMENT,
 ) -> None:
-    card.write(data, formats_of(data, options, extras), NAME, publish)
+    card.write(run_in(data, export=options, render=RenderConfig(extras=tuple(extras)), publish=publish))
 
 
 def written(
     data: Path,
     kind: str,
     options: ExportConfig = OPTIONS,
-    extras: Sequence[Extra] = (),
+    extras: Sequence[RenderedExtra] = (),
     publish: PublishConfig = NO_STATEMENT,
 ) -> str:
     write(data, options, extras, publish)

@@ -18,7 +18,7 @@ from conftest import Once, served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from stand_in_hub import ATTRIBUTES, REPOSITORY, Hub, is_large
 from synthetic import SET, write_lerobot
-from validated_run import NAME, prepare, write_card, write_run
+from validated_run import NAME, RUN, prepare, write_card, write_run
 
 from pipeline.errors import PipelineError
 from pipeline.formats import lerobot_check
@@ -29,13 +29,13 @@ from pipeline.publish.repository import UPLOAD
 
 @pytest.fixture(scope="module")
 def made(once: Once) -> Path:
-    return once("validated_run", write_run)
+    return once(RUN, write_run)
 
 
 @pytest.fixture
 def data(made: Path, tmp_path: Path) -> Path:
     """A copy to spoil, with the times of its files."""
-    return Path(shutil.copytree(made, tmp_path / "data"))
+    return Path(shutil.copytree(made, tmp_path / RUN))
 
 
 @pytest.fixture

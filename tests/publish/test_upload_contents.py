@@ -10,7 +10,7 @@ import pytest
 from conftest import REPOSITORY, Once, dvc, rot
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from synthetic import SET
-from validated_run import NAME, prepare, write_run
+from validated_run import NAME, RUN, prepare, write_run
 
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
@@ -19,13 +19,13 @@ from pipeline.publish.card import REPORTS
 
 @pytest.fixture(scope="module")
 def made(once: Once) -> Path:
-    return once("validated_run", write_run)
+    return once(RUN, write_run)
 
 
 @pytest.fixture
 def data(made: Path, tmp_path: Path) -> Path:
     """A copy to spoil, with the times of its files."""
-    return Path(shutil.copytree(made, tmp_path / "data"))
+    return Path(shutil.copytree(made, tmp_path / RUN))
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from conftest import run_in
 from synthetic import write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
@@ -25,7 +26,7 @@ def prepare(data: Path, kind: str) -> Upload:
         lerobot=LeRobotConfig(name=NAME, shards=3),
         lerobot_v21=LeRobotV21Config(name="synthetic", convention="ipec"),
     )
-    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind), RUN)
+    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind), run_in(data))
 
 
 def write_run(data: Path) -> None:

@@ -28,6 +28,7 @@ from pipeline.report import coverage, figures, pages, report, seen, yields
 from pipeline.report.coverage import Draw
 from pipeline.run import counts, manifest
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.run import Run
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
 from pipeline.types import Quality
@@ -45,7 +46,7 @@ def config(finished: Path, short_demos: Path) -> Iterator[Config]:
 
 @pytest.fixture(scope="module")
 def html(config: Config) -> str:
-    return report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
+    return report.page(Run(config), benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +220,7 @@ def test_the_same_data_give_the_same_figure() -> None:
 def test_an_unfinished_run_says_what_to_run(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(PipelineError, match="python -m pipeline run"):
-        report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
+        report.page(Run(config), benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
 @pytest.mark.parametrize("width_px", [360, 1200])

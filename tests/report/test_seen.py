@@ -19,6 +19,7 @@ from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.report import seen
 from pipeline.run import manifest
+from pipeline.run.run import Run
 from pipeline.seeding import rng
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset import benchmark
@@ -131,14 +132,14 @@ def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:
         quality=Quality(**dict.fromkeys((each.name for each in fields(Quality)), 0)),
     )
     FrameStore(config.data / "frames", config.render).save(rows[0].trajectory_id, rendered, "a GPU")
-    ((_, levels),) = seen._Run(config, {rows[0].episode_id: rows[0]}).of(rows[1])
+    ((_, levels),) = seen._Seen(Run(config), {rows[0].episode_id: rows[0]}).of(rows[1])
     assert levels == pytest.approx(20, abs=1)
 
 
 def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(finished.parents[1])
     config = load(Path("configs/tiny.yaml"))
-    measures = {(one.axis, one.what): one for one in seen.measure(config, test)}
+    measures = {(one.axis, one.what): one for one in seen.measure(Run(config), test)}
     rows = [row for row in manifest.read(finished / "manifest.parquet") if row["kept"]]
     frames = FrameStore(finished / "frames", config.render)
     # The same by another way: what the datasets say of the fingers before the first action.
@@ -173,7 +174,7 @@ def test_twins_that_are_left_out_are_still_compared_with(
     monkeypatch.chdir(finished.parents[1])
     config = load(Path("configs/tiny.yaml"))
     chosen = config.export.model_copy(update={"where": Where(axis=("noise",))})
-    whole, subset = (seen.measure(one, test) for one in (config, config.model_copy(update={"export": chosen})))
+    whole, subset = (seen.measure(Run(one), test) for one in (config, config.model_copy(update={"export": chosen})))
     noise = [one for one in whole if one.axis == "noise"]
     assert any(one.ours for one in noise)
     assert [one for one in subset if one.axis == "noise"] == noise

@@ -13,6 +13,7 @@ from conftest import run_stages
 from pipeline.config import load
 from pipeline.identity import REMAKE
 from pipeline.run import cleaning, dropped, machine, plan_stage
+from pipeline.run.run import Run
 from pipeline.run.work_time import REFERENCE
 from pipeline.stores.frame_store import FrameStore
 from pipeline.validation import doctor, status
@@ -73,11 +74,11 @@ def test_a_run_stops_before_it_deletes_and_status_and_doctor_say_the_same(
         run_stages(clone, fields, stages)
     assert "REMAKE=1" in str(error.value)
     assert work(clone) == before, "nothing was deleted or replaced"
-    config = load(Path("configs/tiny.yaml"))
-    amount = str(dropped.measure(plan_stage.upcoming(config), config))
+    run = Run(load(Path("configs/tiny.yaml")))
+    amount = str(dropped.measure(plan_stage.upcoming(run), run))
     assert amount in str(error.value)
-    assert any(amount in part for part in status.told(config) if isinstance(part, str))
-    finding = doctor._finished(config)
+    assert any(amount in part for part in status.told(run) if isinstance(part, str))
+    finding = doctor._finished(run)
     assert finding.status == "warn"
     assert amount in finding.detail
     monkeypatch.setenv(REMAKE, "1")
@@ -86,20 +87,20 @@ def test_a_run_stops_before_it_deletes_and_status_and_doctor_say_the_same(
 
 def test_datasets_count_as_finished_work_after_their_frames_were_deleted(clone: Path) -> None:
     """Another seed replaces no dataset unasked. The same configuration makes what was deleted without a question."""
-    config = load(Path("configs/tiny.yaml"))
-    cleaning.delete(config.data, ["frames", "trajectories"])
+    cleaning.delete(Run(load(Path("configs/tiny.yaml"))), ["frames", "trajectories"])
     before = work(clone)
-    assert not dropped.measure(plan_stage.upcoming(config), config)
+    run = Run(load(Path("configs/tiny.yaml")))
+    assert not dropped.measure(plan_stage.upcoming(run), run)
     fields = changed(clone, other_seed)
     run_stages(clone, fields, ["inputs"])
     with pytest.raises(AssertionError, match=r"no longer needs.*10 episodes of the datasets, 77%") as error:
         run_stages(clone, fields, ["plan"])
     assert work(clone) == before
-    config = load(Path("configs/tiny.yaml"))
-    amount = str(dropped.measure(plan_stage.upcoming(config), config))
+    run = Run(load(Path("configs/tiny.yaml")))
+    amount = str(dropped.measure(plan_stage.upcoming(run), run))
     assert amount in str(error.value)
-    assert any(amount in part for part in status.told(config) if isinstance(part, str))
-    assert amount in doctor._finished(config).detail
+    assert any(amount in part for part in status.told(run) if isinstance(part, str))
+    assert amount in doctor._finished(run).detail
 
 
 def test_a_replay_alone_deletes_nothing_unasked(clone: Path) -> None:
@@ -116,10 +117,10 @@ def test_a_replay_alone_deletes_nothing_unasked(clone: Path) -> None:
 
 
 def test_what_drops_little_or_nothing_is_not_asked_for(clone: Path) -> None:
-    config = load(Path("configs/tiny.yaml"))
-    rows = plan_stage.upcoming(config)
-    assert plan_stage.is_up_to_date(config)
-    assert dropped.measure(rows, config) == dropped.Dropped()
+    run = Run(load(Path("configs/tiny.yaml")))
+    rows = plan_stage.upcoming(run)
+    assert plan_stage.is_up_to_date(run)
+    assert dropped.measure(rows, run) == dropped.Dropped()
     fields = changed(clone, lambda fields: fields["plan"].update(reserve=2.0))
     assert "no longer" not in run_stages(clone, fields, ["inputs", "plan", "leakage", "replay"])
     shutil.rmtree(clone / "data" / "tiny" / "frames")
@@ -129,13 +130,13 @@ def test_what_drops_little_or_nothing_is_not_asked_for(clone: Path) -> None:
 def test_the_hours_are_those_of_the_frames_that_would_be_rendered_again(clone: Path) -> None:
     """All frames of the run under another JPEG quality, at the measured cost of a frame on the reference machine."""
     config = load(Path("configs/tiny.yaml"))
-    machine.keep_speed(config.data, REFERENCE)
+    machine.keep_speed(Run(config), REFERENCE)
     stored = FrameStore(config.data / "frames", config.render).rows().values()
     frames = sum(len(row["streams"]) * row["steps"] for row in stored)
     assert frames > 100
     changed(clone, other_quality)
-    config = load(Path("configs/tiny.yaml"))
-    found = dropped.measure(plan_stage.upcoming(config), config)
+    run = Run(load(Path("configs/tiny.yaml")))
+    found = dropped.measure(plan_stage.upcoming(run), run)
     mean_s = (0.032 + 0.041 + 0.022 + 0.034 + 0.041 + 0.033 + 0.024 + 0.047 + 0.028 + 0.035) / 10 + 0.004
     assert found.work_s == pytest.approx(frames * mean_s)
     assert found.trajectories == 0

@@ -18,6 +18,7 @@ from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run import manifest
 from pipeline.run.cleaning import PARTS
 from pipeline.run.export import notice_changes
+from pipeline.run.run import Run
 from pipeline.validation.validate import EpisodesJob
 
 STAGES = ("inputs", "render", "export_rlds", "export_lerobot", "manifest", "validate")
@@ -87,7 +88,7 @@ def test_validate_checks_them_and_finds_a_success_among_them(asked: Path, tmp_pa
         place = table.schema.get_field_index("success")
         pq.write_table(table.set_column(place, table.schema.field("success"), succeeded), file)
         sets = failures_of(config.data, config.export)
-        job = EpisodesJob(config, config.data, sets, tmp_path / "cache", frozenset(), ("outcome",))
+        job = EpisodesJob(Run(config), sets, tmp_path / "cache", frozenset(), ("outcome",))
         found = job([missed[0] | places(sets)[missed[0]["episode_id"]]]).findings
     told = {check: {fault.dataset for fault in faults} for check, faults in found.items() if faults}
     assert told == {"provenance": {"lerobot"}}

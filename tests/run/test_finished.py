@@ -13,8 +13,9 @@ from pipeline.config import Config, load
 from pipeline.formats.registry import formats_of
 from pipeline.run import export
 from pipeline.run.finished import Memory, of_previews, of_report, of_summary, of_validate
+from pipeline.run.run import Run
 
-REMEMBERED: tuple[Callable[[Config], Memory], ...] = (of_validate, of_summary, of_report, of_previews)
+REMEMBERED: tuple[Callable[[Run], Memory], ...] = (of_validate, of_summary, of_report, of_previews)
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def config(clone: Path) -> Config:
 
 def hold(config: Config) -> list[bool]:
     """Whether ``validate``, ``summary`` and ``report`` would do nothing, and ``summary`` would leave the previews."""
-    return [of(config).holds() for of in REMEMBERED]
+    return [of(Run(config)).holds() for of in REMEMBERED]
 
 
 def largest(folder: Path) -> Path:
@@ -80,7 +81,7 @@ def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[boo
 def test_what_found_something_off_is_not_remembered(config: Config) -> None:
     rot(largest(config.data / "rlds"))
     (config.data / "validation.json").unlink()
-    assert not of_validate(config).holds(), "so everything is read again, also what looks unchanged"
+    assert not of_validate(Run(config)).holds(), "so everything is read again, also what looks unchanged"
 
 
 def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Config) -> None:

@@ -11,9 +11,10 @@ from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import _bring_up_to_date
+from pipeline.run.run import Run
 
 PLAN = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
-CONFIG = Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}})
+RUN = Run(Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}}))
 
 
 @pytest.mark.parametrize("content", ["first", "second"], ids=["nothing to do", "another dataset to write"])
@@ -24,7 +25,7 @@ def test_liberos_sets_beside_ours_are_refused_and_stay(content: str, tmp_path: P
     target.folder.joinpath("libero_10_no_noops").symlink_to(elsewhere)
     before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
     with pytest.raises(PipelineError, match=re.escape("rlds/libero_10_no_noops: not of this run's RLDS")) as error:
-        _bring_up_to_date(target, episodes(content=content), CONFIG)
+        _bring_up_to_date(target, episodes(content=content), RUN)
     assert "(2 such)" in str(error.value)
     assert f"move it out of {target.folder}" in str(error.value)
     assert {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")} == before
@@ -35,7 +36,7 @@ def test_another_lerobot_set_is_refused(write: Any, tmp_path: Path) -> None:
     target = write(tmp_path)
     (target.folder / "libero").mkdir()
     with pytest.raises(PipelineError, match="not of this run's LeRobot"):
-        _bring_up_to_date(target, episodes(), CONFIG)
+        _bring_up_to_date(target, episodes(), RUN)
     assert (target.folder / "libero").is_dir()
 
 
@@ -43,9 +44,9 @@ def test_sets_of_the_run_are_no_foreign_ones(tmp_path: Path) -> None:
     """Not those under a former name, nor where a damaged file has cost the record."""
     target = write_rlds(tmp_path)
     renamed = Rlds(tmp_path, target.options.model_copy(update={"name": "other"}))
-    _bring_up_to_date(renamed, episodes(), CONFIG)
+    _bring_up_to_date(renamed, episodes(), RUN)
     renamed.record_file.unlink()
-    _bring_up_to_date(renamed, episodes(), CONFIG)
+    _bring_up_to_date(renamed, episodes(), RUN)
     assert [path.name for path in renamed.folder.iterdir()] == ["other_spatial"]
 
 
@@ -57,5 +58,5 @@ def test_a_file_inside_a_set_is_refused_and_stays(content: str, write: Any, tmp_
     theirs = next(path for path in target.folder.rglob("*.json")).parent / "README.md"
     theirs.write_text("mine")
     with pytest.raises(PipelineError, match=r"README\.md: not of this run's"):
-        _bring_up_to_date(target, episodes(content=content), CONFIG)
+        _bring_up_to_date(target, episodes(content=content), RUN)
     assert theirs.read_text() == "mine"

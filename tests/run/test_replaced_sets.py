@@ -20,9 +20,10 @@ from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import _bring_up_to_date, notice_changes
+from pipeline.run.run import Run
 
 PLAN = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
-CONFIG = Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}})
+RUN = Run(Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}}))
 
 CHANGES = {"os.rename", "os.remove", "os.rmdir"}
 """What Python's audit reports of rename and replace, of unlink and remove, and of rmdir, before it happens."""
@@ -39,7 +40,7 @@ def target(name: str, data: Path, called: str) -> Format[Any]:
 def command(name: str, data: Path) -> None:
     """What a run does with one format: the stage ``inputs``, then that of the export."""
     notice_changes(target(name, data, "new"))
-    _bring_up_to_date(target(name, data, "new"), episodes(), CONFIG)
+    _bring_up_to_date(target(name, data, "new"), episodes(), RUN)
 
 
 def in_a_fork(action: Callable[[], None]) -> int:
@@ -79,7 +80,7 @@ def kill_everywhere(name: str, folder: Path) -> None:
     """In a process of its own: print how many kills there were, and what the same command then came to."""
     expected, before, prepared = (folder / part for part in ("expected", "before", "prepared"))
     command(name, expected)
-    _bring_up_to_date(target(name, before, "old"), episodes(), CONFIG)
+    _bring_up_to_date(target(name, before, "old"), episodes(), RUN)
     shutil.copytree(before, prepared)
     killed = in_a_fork(lambda: killed_before(1, name, prepared))
     assert killed == -signal.SIGKILL

@@ -15,6 +15,7 @@ from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
 from pipeline.run.render_job import RenderJob
+from pipeline.run.run import Run
 from pipeline.validation.validate import validate
 
 SEED = 15
@@ -105,5 +106,5 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
     assert all(reserve.exists() for reserve in reserves)
 
     monkeypatch.chdir(clone)
-    report = validate(load(Path("configs/tiny.yaml")), loop)
+    report = validate(Run(load(Path("configs/tiny.yaml"))), loop)
     assert not any(found["findings"] for found in report.values())

@@ -32,10 +32,10 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.subtasks import subtasks
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
-from pipeline.run import manifest, outcome
+from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import episodes_of
-from pipeline.run.finished import FOLDER
+from pipeline.run.run import FINISHED, STATISTICS, Run
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 
@@ -181,7 +181,7 @@ def test_statistics_and_sheets(finished: Path, rows: list[dict[str, Any]]) -> No
 
 
 def test_openvla_oft_would_train_on_all_of_it(finished: Path, rows: list[dict[str, Any]]) -> None:
-    found = oft.check_run(finished)
+    found = oft.check_all(finished / "rlds", finished / STATISTICS)
     assert [dataset["violations"] for dataset in found.values()] == [[], []]
     kept = [row for row in rows if row["kept"]]
     assert sum(dataset["chunks"] for dataset in found.values()) == sum(row["steps"] - 7 for row in kept)
@@ -225,14 +225,14 @@ def test_a_full_disk_leaves_what_a_stage_wrote_before(
         write(file, content[: len(content) // 2])
         raise OSError(errno.ENOSPC, "No space left on device", str(file))
 
-    shutil.rmtree(clone / "data" / "tiny" / FOLDER)  # Or validate would have nothing to do.
+    shutil.rmtree(clone / "data" / "tiny" / FINISHED)  # Or validate would have nothing to do.
     monkeypatch.chdir(clone)
     monkeypatch.setattr(Path, "write_bytes", half)
     # How long it takes is no subject here.
     monkeypatch.setattr("pipeline.validation.validate.validate", lambda *_: report)
     run = runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"))["run"]
     with pytest.raises(OSError, match="No space left"):
-        run(load(Path("configs/tiny.yaml")))
+        run(Run(load(Path("configs/tiny.yaml"))))
     for file in finished.glob("*.json"):
         assert (clone / "data" / "tiny" / file.name).read_bytes() == file.read_bytes(), file.name
 
@@ -314,7 +314,7 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(
             section = section.setdefault(key, {})
         section[keys[-1]] = value
         file.write_text(yaml.safe_dump(config))
-        run_inputs(load(file))
+        run_inputs(Run(load(file)))
         assert stages_to_run(clone) == expected | {"inputs", "doctor"}, keys
 
 
@@ -326,7 +326,7 @@ def test_a_format_that_takes_language_gets_rewrites_and_subtasks(
     plain = LeRobot(config.data, config.export.lerobot or LeRobotConfig())
     # Where lerobot is older, reading a configuration refuses it.
     told = LeRobot(config.data, plain.options.model_copy(update={"language": True}))
-    episodes, given = (episodes_of(target, config, outcome.read(config)) for target in (plain, told))
+    episodes, given = (episodes_of(target, Run(config)) for target in (plain, told))
     assert not {one.content for one in given.known.values()} & {one.content for one in episodes.known.values()}
     bank = yaml.safe_load(BANK_FILE.read_text())
     for row in (row for row in rows if row["kept"]):

@@ -65,7 +65,7 @@ def test_an_edited_file_keeps_its_folder_however_it_is_named(clone: Path) -> Non
     config = yaml.safe_load(file.read_text())
     config["plan"]["seed"] = 8
     file.write_text(yaml.safe_dump(config))
-    assert claimed(file).plan.seed == owned(Path("configs/../configs/tiny.yaml")).plan.seed == 8
+    assert claimed(file).plan.seed == owned(Path("configs/../configs/tiny.yaml")).config.plan.seed == 8
 
 
 def edit(file: Path, **fields: object) -> None:
@@ -124,7 +124,7 @@ def test_a_file_may_be_named_by_its_absolute_path_and_from_elsewhere(
     edit(file, folder=str(clone / "results"))
     claimed(file)
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
-    assert claimed(clone / file).data == owned(clone / file).data == clone / "results" / "tiny"
+    assert claimed(clone / file).data == owned(clone / file).folder == clone / "results" / "tiny"
     monkeypatch.chdir(clone)
     claimed(file)
 
@@ -160,7 +160,7 @@ def test_a_folder_that_was_moved_to_where_the_configuration_says_is_found(
     claimed(file)
     shutil.move("data/tiny", disk / "tiny")
     edit(file, folder=str(disk))
-    assert claimed(file).data == owned(file).data == disk / "tiny"
+    assert claimed(file).data == owned(file).folder == disk / "tiny"
     edit(file, plan={"seed": 6, "episodes": {"noise": 4}})
     claimed(file)
     shutil.move(disk / "tiny", "data/tiny")

@@ -4,17 +4,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import run_in
 
-from pipeline.config import Config
 from pipeline.run.cleaning import found, say_stale
 
 
 def said(data: Path, export: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> dict[str, list[str]]:
     """Folder to the words that are said of it, by the stages of both parts."""
-    plan = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
-    config = Config.model_validate({"name": data.name, "folder": data.parent, "plan": plan, "export": export})
+    run = run_in(data, export=export)
     for part in ("rlds", "lerobot"):
-        say_stale(part, config)
+        say_stale(part, run)
     words = [line.split() for line in capsys.readouterr().out.splitlines()]
     return {str(Path(line[0]).relative_to(data)): line for line in words}
 
@@ -38,4 +37,4 @@ def test_parts_that_are_there_have_their_megabytes(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         with (tmp_path / name).open("wb") as file:
             file.truncate(size)
-    assert found(tmp_path, ("rlds", "frames", "tables")) == {"frames": 3.0, "tables": 0.001}
+    assert found(run_in(tmp_path), ("rlds", "frames", "tables")) == {"frames": 3.0, "tables": 0.001}

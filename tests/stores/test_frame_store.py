@@ -87,17 +87,16 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(Config, "data", tmp_path)
     monkeypatch.delenv(identity.REMAKE, raising=False)
-    shutil.copytree(replayed, tmp_path / "trajectories")
+    stored = TrajectoryStore(shutil.copytree(replayed, tmp_path / "trajectories"))
     store = FrameStore(tmp_path / "frames", config.render)
     store.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
-    assert not outdated(rows, config, gl.choose().device)
+    assert not outdated(rows, stored, store, gl.choose().device)
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
 
     next_recipe(step)
     number = f"recipe of {step} {identity.RECIPES[step] - 1}, here {identity.RECIPES[step]}"
-    found = outdated(rows, config)
+    found = outdated(rows, TrajectoryStore(stored.root), FrameStore(store.root, config.render))
     told = {f"files of frames, made with {number}": 1}
     assert found == told | ({f"trajectories, made with {number}": 1} if step == "physics" else {})
     with pytest.raises(PipelineError, match=rf"1 files of frames, made with {number}(?s:.*)REMAKE=1` before"):
@@ -110,23 +109,23 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
         monkeypatch.delenv(identity.REMAKE)
         again = FrameStore(tmp_path / "frames", config.render)
         again.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
-        assert not outdated(rows, config, gl.choose().device), "a remake is asked for once"
+        assert not outdated(rows, stored, again, gl.choose().device), "a remake is asked for once"
         assert again._known().keys() == {again.made_by}
 
 
 def test_what_the_user_changed_is_made_without_a_question(
-    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(Config, "data", tmp_path)
-    shutil.copytree(replayed, tmp_path / "trajectories")
+    stored = TrajectoryStore(shutil.copytree(replayed, tmp_path / "trajectories"))
     store = FrameStore(tmp_path / "frames", config.render)
     store.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
     other = config.model_copy(update={"render": config.render.model_copy(update={"jpeg_quality": 80})})
-    assert not FrameStore(tmp_path / "frames", other.render).rows()
-    assert not outdated(rows, other, gl.choose().device)
-    device = outdated(rows, config, "another device")
+    changed = FrameStore(tmp_path / "frames", other.render)
+    assert not changed.rows()
+    assert not outdated(rows, stored, changed, gl.choose().device)
+    device = outdated(rows, stored, store, "another device")
     assert device == {f"files of frames, made with OpenGL device {gl.choose().device}, here another device": 1}
-    assert not outdated([], config), "a file that no episode of today's plan needs"
+    assert not outdated([], stored, store), "a file that no episode of today's plan needs"
 
 
 def without_twins(rows: Sequence[plan.Row]) -> list[plan.Row]:

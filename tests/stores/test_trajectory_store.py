@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from bowl import bowl_config, bowl_plan, given_up, nothing_to_do, replay_bowl
-from conftest import Once, limited, read_with_flipped_bits
+from conftest import Once, limited, read_with_flipped_bits, run_in
 
 from pipeline.compute.pool import loop
 from pipeline.config import Config, FilterConfig
@@ -140,7 +140,7 @@ def test_a_damaged_trajectory_is_an_error_with_its_reason_and_is_never_silently_
     for read in (
         lambda: TrajectoryStore(trajectories).row(file.stem),
         lambda: TrajectoryStore(trajectories).load(file.stem),
-        lambda: outcome.replayed(rows, trajectories),
+        lambda: outcome.replayed(rows, TrajectoryStore(trajectories)),
         lambda: Replays(config.demos, config.replay, trajectories, nothing_to_do).of(rows),
     ):
         with pytest.raises(PipelineError, match=rf"(?s){file.name}: damaged \(.+\).*move the file away"):
@@ -159,10 +159,10 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     before = file.read_bytes()
     fault(file)
     with pytest.raises(PipelineError, match=rf"(?s){file.name}.*stages/replay.py CONFIG"):
-        outcome.replayed(rows, trajectories)
+        outcome.replayed(rows, TrajectoryStore(trajectories))
     Replays(config.demos, config.replay, trajectories, loop).of(rows)
     assert file.read_bytes() == before
-    assert outcome.replayed(rows, trajectories)
+    assert outcome.replayed(rows, TrajectoryStore(trajectories))
 
 
 @pytest.mark.parametrize("error", [MemoryError("mine"), KeyError("mine"), ValueError("mine"), OSError("mine")])
@@ -270,28 +270,31 @@ def test_2000_files_are_read_while_another_thread_keeps_the_frames_of_the_reader
 
 
 def test_files_that_nobody_wrote_down_what_they_were_made_with_are_not_replaced_unasked(
-    config: Config, rows: list[plan.Row], trajectories: Path, monkeypatch: pytest.MonkeyPatch
+    rows: list[plan.Row], trajectories: Path
 ) -> None:
     """As those of the versions before."""
-    monkeypatch.setattr(Config, "data", trajectories.parent)
+    run = run_in(trajectories.parent)
     _make_foreign(next(trajectories.glob("*.npz")))
-    assert outdated(rows, config) == {"trajectories, made with something that was not written down": 1}
+    assert outdated(rows, run.trajectories, run.frames) == {
+        "trajectories, made with something that was not written down": 1
+    }
     _shorten(next(trajectories.glob("*.npz")))
     with pytest.raises(PipelineError, match="damaged"):
-        outdated(rows, config)
+        outdated(rows, run.trajectories, run.frames)
 
 
-def test_hdf5_files_of_an_earlier_version_are_not_replaced_unasked(
-    config: Config, rows: list[plan.Row], trajectories: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Config, "data", trajectories.parent)
+def test_hdf5_files_of_an_earlier_version_are_not_replaced_unasked(rows: list[plan.Row], trajectories: Path) -> None:
+    run = run_in(trajectories.parent)
     file = next(trajectories.glob("*.npz"))
     file.rename(file.with_suffix(".h5"))
     frames = trajectories.parent / "frames" / file.stem / "0123.h5"
     frames.parent.mkdir(parents=True)
     frames.write_bytes(b"frames of an earlier version")
     earlier = "made with the HDF5 container of an earlier version"
-    assert outdated(rows, config) == {f"trajectories, {earlier}": 1, f"files of frames, {earlier}": 1}
+    assert outdated(rows, run.trajectories, run.frames) == {
+        f"trajectories, {earlier}": 1,
+        f"files of frames, {earlier}": 1,
+    }
 
 
 def test_the_table_no_longer_tells_of_a_file_that_is_gone(trajectories: Path) -> None:
@@ -314,4 +317,4 @@ def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_agai
     assert Replays(config.demos, config.replay, tmp_path, nothing_to_do).of(rows) == judged
     assert {verdict.reason for verdict in selection.select(rows, judged).values()} == {"worker_lost"}
     assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
-    assert outcome.replayed(rows, tmp_path)
+    assert outcome.replayed(rows, TrajectoryStore(tmp_path))

@@ -6,17 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
-from conftest import BOWL
+from conftest import BOWL, run_in
 from synthetic import IDS, episode
 
 from pipeline.axes import Axes, to_json
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.axes.noise import NoiseAxis
-from pipeline.config import PlanConfig, ReplayConfig
+from pipeline.config import PlanConfig, RenderConfig, ReplayConfig
 from pipeline.files import write_json
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import plan
+from pipeline.run import manifest
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Scene, Trajectory, Verdict
@@ -93,5 +95,8 @@ def test_a_manifest_that_does_not_follow_from_the_plan_is_found(
         plant(rows)
     for row in rows:
         row |= {"kept": row["reason"] == "kept", "chosen": True, "steps": 90}
+    table = pa.Table.from_pylist(rows, schema=manifest.schema())
+    settings = manifest.Settings(source="starter", replay=ReplayConfig(), render=RenderConfig())
+    manifest.write(table, tmp_path / "manifest.parquet", settings)
     write_json(tmp_path / "counts.json", by_axis_and_suite(rows))
-    assert [fault.what for fault in _counts(tmp_path, rows)] == ([] if what is None else [what])
+    assert [fault.what for fault in _counts(run_in(tmp_path))] == ([] if what is None else [what])

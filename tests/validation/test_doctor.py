@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from conftest import BOWL, MILK, REPOSITORY, STOVE, link_testset, tiny_config
+from conftest import BOWL, MILK, REPOSITORY, STOVE, link_testset, run_in, tiny_config
 
 from pipeline import __main__ as command_line
 from pipeline import gl
@@ -21,6 +21,7 @@ from pipeline.export_config import ExportConfig, LeRobotConfig
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import machine
+from pipeline.run.run import MACHINE, Run
 from pipeline.run.work_time import REFERENCE
 from pipeline.stores.sealed_file import seal
 from pipeline.testset import benchmark
@@ -43,7 +44,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
 def found(folder: Path, need_gb: float = 0.001, demos: DemosConfig | None = None) -> dict[str, doctor.Diagnosis]:
     changes = {"folder": folder, "demos": demos or DemosConfig()}
     config = load(REPOSITORY / "configs" / "starter.yaml").model_copy(update=changes)
-    return {finding.name: finding for finding in doctor.check(config, need_gb)}
+    return {finding.name: finding for finding in doctor.check(Run(config), need_gb)}
 
 
 def failures(folder: Path, need_gb: float = 0.001, demos: DemosConfig | None = None) -> dict[str, doctor.Diagnosis]:
@@ -54,11 +55,11 @@ def run_doctor(name: str, monkeypatch: pytest.MonkeyPatch, *, free_gb: float, **
     """The command on a shipped configuration, with so much disk free."""
     config = load(REPOSITORY / "configs" / f"{name}.yaml").model_copy(update=changes)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free_gb * 1e9))
-    return doctor.run(config)
+    return doctor.run(Run(config))
 
 
 def run_stage(config: Config) -> None:
-    runpy.run_path(str(REPOSITORY / "stages" / "doctor.py"))["run"](config)
+    runpy.run_path(str(REPOSITORY / "stages" / "doctor.py"))["run"](Run(config))
 
 
 def test_a_machine_that_was_set_up_is_fine(tmp_path: Path) -> None:
@@ -262,10 +263,11 @@ def stored(folder: Path, *names: str) -> Path:
 
 
 def test_a_speed_that_another_version_wrote_is_measured_anew(tmp_path: Path) -> None:
-    machine.keep_speed(tmp_path, REFERENCE)
-    assert machine.known_speed(tmp_path) == REFERENCE
+    run = run_in(tmp_path)
+    machine.keep_speed(run, REFERENCE)
+    assert machine.known_speed(run) == REFERENCE
     (tmp_path / machine.SPEED).write_text('{"step_s": 0.01, "frame_s": 0.1, "devices": 2}')
-    assert machine.known_speed(tmp_path) is None
+    assert machine.known_speed(run) is None
 
 
 def test_the_command_writes_nothing_and_a_run_begins_on_another_machine(
@@ -279,7 +281,7 @@ def test_the_command_writes_nothing_and_a_run_begins_on_another_machine(
     assert sorted(tmp_path.rglob("*")) == before
     trial["OpenGL device"] = "two"
     run_stage(load(REPOSITORY / "configs" / "starter.yaml"))
-    recorded = json.loads((tmp_path / "data" / "starter" / machine.FILE).read_text())
+    recorded = json.loads((tmp_path / "data" / "starter" / MACHINE).read_text())
     assert recorded["made with"] == made_with("encoding") | {"OpenGL device": "two"}
     assert sorted(recorded["trials"].values()) == ["0123", "4567"]
 
@@ -317,33 +319,34 @@ TRIAL = {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"}
 
 def test_a_run_is_not_gone_on_with_where_the_same_versions_compute_otherwise(tmp_path: Path) -> None:
     """Its files would count as current, and be of two kinds."""
-    folder = stored(tmp_path / "run", "trajectories", "frames")
-    machine.record(folder, TRIAL)
+    run = run_in(stored(tmp_path / "run", "trajectories", "frames"))
+    machine.record(run, TRIAL)
     cases = {"ten steps": "its trajectories and its frames", "one frame": "its frames"}
     for name, store in cases.items():
         with pytest.raises(PipelineError, match=f"the run was begun where {name}, made by") as caught:
-            machine.record(folder, TRIAL | {name: "other"})
-        assert str(caught.value).endswith(f"delete {store}")
-    machine.record(folder, TRIAL | {"OpenGL device": "two", "one frame": "cdef"})
-    machine.record(folder, TRIAL)
+            machine.record(run, TRIAL | {name: "other"})
+        assert str(caught.value).endswith(f"move away {store}")
+    machine.record(run, TRIAL | {"OpenGL device": "two", "one frame": "cdef"})
+    machine.record(run, TRIAL)
 
 
 def test_what_nothing_was_made_with_yet_may_change(tmp_path: Path) -> None:
     """A login node may plan, nodes without OpenGL replay, and others render."""
-    folder = tmp_path / "run"
-    machine.record(folder, TRIAL)
-    machine.record(folder, TRIAL | {"ten steps": "89ab"})
-    stored(folder, "trajectories")
-    machine.record(folder, TRIAL | {"ten steps": "89ab", "one frame": "cdef"})
+    run = run_in(tmp_path / "run")
+    machine.record(run, TRIAL)
+    machine.record(run, TRIAL | {"ten steps": "89ab"})
+    stored(run.folder, "trajectories")
+    machine.record(run, TRIAL | {"ten steps": "89ab", "one frame": "cdef"})
     with pytest.raises(PipelineError, match=r"ten steps, made by .* came to 89ab, here it is 0123"):
-        machine.record(folder, TRIAL | {"one frame": "cdef"})
+        machine.record(run, TRIAL | {"one frame": "cdef"})
 
 
 def test_an_older_record_says_nothing_of_trials(tmp_path: Path) -> None:
     folder = stored(tmp_path / "run", "trajectories")
-    (folder / machine.FILE).write_text(json.dumps({"mujoco": "3.2.7", "ten steps": "89ab"}))
-    machine.record(folder, TRIAL)
-    assert machine.trials(folder)
+    run = run_in(folder)
+    run.path(MACHINE).write_text(json.dumps({"mujoco": "3.2.7", "ten steps": "89ab"}))
+    machine.record(run, TRIAL)
+    assert machine.trials(run)
 
 
 def test_a_damaged_file_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

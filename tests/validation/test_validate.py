@@ -25,6 +25,7 @@ from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.images.jpeg import decode, encode
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.run import Run
 from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
@@ -289,7 +290,7 @@ def test_what_is_missing_or_cannot_be_read_is_a_finding(
     rot(rotten)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])  # Tested above, and slow.
-    report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
+    report = validate(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
     told = sorted((finding["dataset"], finding["what"]) for finding in report["readable"]["findings"])
     assert [dataset for dataset, _ in told] == ["lerobot", "rlds", "rlds"]
     assert re.search(rf"{cut.name}: record \d+ is damaged", told[1][1])

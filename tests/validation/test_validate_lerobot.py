@@ -24,8 +24,9 @@ from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.read_back import Fault
 from pipeline.formats.registry import formats_of
-from pipeline.run import manifest, outcome
+from pipeline.run import manifest
 from pipeline.run.export import episodes_of, export
+from pipeline.run.run import Run
 from pipeline.validation.validate import EpisodesJob
 
 Rows = list[dict[str, Any]]
@@ -44,7 +45,7 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         config = with_v21(finished)
         assert config.export.lerobot_v21 is not None
         target = LeRobotV21(config.data, config.export.lerobot_v21)
-        export(target, episodes_of(target, config, outcome.read(config)), loop)
+        export(target, episodes_of(target, Run(config)), loop)
     return folder
 
 
@@ -56,10 +57,11 @@ def with_v21(finished: Path) -> Config:
 
 def checked(version: str, config: Config) -> dict[str, list[Fault]]:
     """What is found in one dataset, by check; nothing is rendered anew."""
-    data = config.data.resolve()
+    run = Run(config).resolved()
+    data = run.folder
     kept = {row["episode_id"]: row for row in manifest.read(data / "manifest.parquet") if row["kept"]}
     (target,) = (one for one in formats_of(data, config.export) if one.name == version)
-    results = EpisodesJob(config, data, [target], data, frozenset())(list(kept.values()))
+    results = EpisodesJob(run, [target], data, frozenset())(list(kept.values()))
     with suppress(PipelineError):  # An episode says it too.
         for check, fault in target.check(kept, data / "cache"):
             results.note(check, [fault])
@@ -196,8 +198,8 @@ def test_language_columns_are_held_against_what_was_to_be_written(
     config = config.model_copy(update={"export": config.export.model_copy(update={"lerobot": told})})
     monkeypatch.chdir(tmp_path)
     target = LeRobot(config.data, told)
-    export(target, episodes_of(target, config, outcome.read(config)), loop)
-    job = EpisodesJob(config, config.data, [target], config.data, frozenset())
+    export(target, episodes_of(target, Run(config)), loop)
+    job = EpisodesJob(Run(config), [target], config.data, frozenset())
     rows = [row for row in manifest.read(config.data / "manifest.parquet") if row["kept"]]
     assert not any(job(rows).findings.values())
     file = min(target.root.glob("data/*/*"))

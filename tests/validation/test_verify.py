@@ -9,6 +9,7 @@ from conftest import rot
 
 from pipeline.compute.pool import loop
 from pipeline.config import load
+from pipeline.run.run import Run
 from pipeline.validation.validate import validate
 from pipeline.validation.verify import verify
 
@@ -19,11 +20,11 @@ def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -
     shutil.copytree(finished, data)
     config = load(finished.parent.parent / "configs" / "tiny.yaml")
     with chdir(tmp_path):
-        assert all(result["checked"] and not result["damaged"] for result in verify(config, loop).values())
+        assert all(result["checked"] and not result["damaged"] for result in verify(Run(config), loop).values())
         # The largest: a file that holds data.
         file = max((path for path in (data / part).rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
         rot(file)
-        results = verify(config, loop)
+        results = verify(Run(config), loop)
     (told,) = results.pop(part)["damaged"]
     assert str(file.relative_to(data)) in told
     assert "move" in told
@@ -39,9 +40,9 @@ def test_check_finds_a_deleted_file(part: str, finished: Path, tmp_path: Path) -
     stored = [file for file in files if file.is_file()]
     stored[0].unlink()
     with chdir(tmp_path):
-        with_table = verify(config, loop)[part]
+        with_table = verify(Run(config), loop)[part]
         (data / part / "index.parquet").unlink()
-        without_table = verify(config, loop)
+        without_table = verify(Run(config), loop)
     (told,) = with_table["damaged"]
     assert (with_table["checked"], told.partition(":")[0]) == (len(stored), str(stored[0].relative_to(tmp_path)))
     assert "gone" in told
@@ -54,7 +55,7 @@ def test_check_finds_a_deleted_table(name: str, finished: Path, tmp_path: Path) 
     shutil.copytree(finished, data)
     (data / name).unlink()
     with chdir(tmp_path):
-        results = verify(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
+        results = verify(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
     assert any(name in what for what in results["tables"]["damaged"])
 
 
@@ -67,6 +68,6 @@ def test_a_changed_dataset_is_not_read_any_further(
     for name in ("rlds", "lerobot"):
         rot(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))
     with chdir(tmp_path):
-        report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
+        report = validate(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
     assert {finding["dataset"] for finding in report["checksums"]["findings"]} == {"rlds", "lerobot"}
     assert not any(result["findings"] for check, result in report.items() if check != "checksums")
