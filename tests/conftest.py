@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import pytest
 import yaml
 from filelock import FileLock
+from hypothesis import settings
 
 from pipeline import M_MMAP_THRESHOLD
 from pipeline.config import Config, ReplayConfig
@@ -47,6 +48,10 @@ REPOSITORY = Path(__file__).parent.parent
 SCRIPTS = Path(sys.executable).parent
 IN_SCRIPTS = {**os.environ, "PATH": f"{SCRIPTS}{os.pathsep}{os.environ['PATH']}"}
 """Environment variables for DVC, whose stages call `python`."""
+
+# Hypothesis stops an example after 200 ms by default, which a busy machine exceeds.
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
 
 LIBC = ctypes.CDLL("libc.so.6")
 # glibc returns freed blocks of this size to the system; without a fixed size it soon keeps those of a whole scene.
