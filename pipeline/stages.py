@@ -318,7 +318,7 @@ STAGES = {
     ),
     "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
-    "recipe": Stage(write_recipe, ("export",), (MANIFEST, *_RECORDS), (FINETUNE,)),
+    "recipe": Stage(write_recipe, ("export",), (MANIFEST, "lerobot.json", "lerobot_v21.json"), (FINETUNE,)),
     "summary": Stage(summarize),
     "card": Stage(write_card, ("export", "publish"), (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
     "report": Stage(write_report),
