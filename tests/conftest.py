@@ -300,7 +300,7 @@ def finished(short_demos: Path, once: Once) -> Path:
 
 def _run_in_clone(short_demos: Path, clone: Path) -> None:
     in_a_clone(tiny_config(short_demos), clone)
-    done = dvc(clone, "repro")
+    done = run_pipeline(clone, "run", "configs/tiny.yaml")
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -344,6 +344,12 @@ def in_a_clone(config: dict[str, object], clone: Path) -> None:
     shutil.copytree(REPOSITORY / ".dvc", clone / ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
     link_testset(clone)
     subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
+
+
+def run_pipeline(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Call ``python -m pipeline`` in a folder."""
+    command = [sys.executable, "-m", "pipeline", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=IN_SCRIPTS)
 
 
 def dvc(clone: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
