@@ -78,10 +78,14 @@ def write_inputs(run: Run) -> None:
     run.frames.notice_changes()
     for dataset in (*run.formats, *run.failure_formats):
         export.notice_changes(dataset)
-    # DVC knows no other file of these datasets, as not every run has them.
-    lost = [dataset.record_file for dataset in run.failure_formats if not dataset.record_file.exists()]
-    names = [file.relative_to(run.folder).as_posix() for file in lost]
-    write_json(run.path(SETTINGS), {**inputs.settings(run.config), "lost": names})
+    write_json(run.path(SETTINGS), {**inputs.settings(run.config), "lost": _lost(run)})
+
+
+def _lost(run: Run) -> list[str]:
+    """List the missing records that are no outputs for DVC, as not every run has these datasets."""
+    datasets = (*run.formats, *run.failure_formats)
+    records = [dataset.record_file for dataset in datasets if dataset.record_file != dataset.stage_record]
+    return [file.relative_to(run.folder).as_posix() for file in records if not file.exists()]
 
 
 def doctor(run: Run) -> None:
@@ -362,8 +366,13 @@ def perform(name: str, run: Run) -> None:
 
 
 def _memory(name: str, run: Run) -> Memory | None:
+    """Return what the stage remembers of its last call, `None` for a stage that runs every time."""
     stage = STAGES[name]
-    return finished.of_stage(run, name, stage.settings, stage.inputs, stage.outputs) if stage.outputs else None
+    if not stage.outputs:
+        return None
+    settings = inputs.settings(run.config)
+    chosen = {section: settings[section] for section in stage.settings}
+    return finished.of_stage(run, name, chosen, stage.inputs, stage.outputs)
 
 
 def script(name: str) -> None:

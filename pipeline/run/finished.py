@@ -32,7 +32,6 @@ from pipeline.run.run import (
     PLAN,
     PREVIEWS,
     REPORT,
-    SETTINGS,
     SHEETS,
     STATISTICS,
     TRAJECTORIES,
@@ -83,22 +82,23 @@ class Memory:
         return {"made_by": self.made_by, "outputs": _contents([self.data / name for name in self.outputs], self.data)}
 
 
-def of_stage(run: Run, name: str, sections: Sequence[str], inputs: Sequence[str], outputs: Sequence[str]) -> Memory:
+def of_stage(
+    run: Run, name: str, settings: Mapping[str, object], inputs: Sequence[str], outputs: Sequence[str]
+) -> Memory:
     """Return the memory of a stage whose outputs depend on this library, its settings and its input files.
 
     Args:
-        sections: fields of ``settings.json``.
+        settings: JSON-serialisable.
         inputs: files and folders of the run.
         outputs: files and folders of the run.
     """
     try:
-        settings = read_json(run.path(SETTINGS))
         packages = [fingerprint(step) for step in RECIPES]
     except (PipelineError, PackageNotFoundError):
         # The stage doctor names the fault.
         return Memory(run.folder, name, None, outputs)
     contents = _contents([run.path(file) for file in inputs], run.folder)
-    made_by = digest(library(), packages, {section: settings.get(section) for section in sections}, contents)
+    made_by = digest(library(), packages, dict(settings), contents)
     return Memory(run.folder, name, made_by, outputs)
 
 

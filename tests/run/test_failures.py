@@ -17,8 +17,8 @@ from pipeline.formats.registry import failures_of, places
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run import manifest
 from pipeline.run.cleaning import PARTS
-from pipeline.run.export import notice_changes
 from pipeline.run.run import Run
+from pipeline.stages import write_inputs
 from pipeline.validation.validate import EpisodesJob
 
 STAGES = ("inputs", "render", "export_rlds", "export_lerobot", "manifest", "validate")
@@ -100,12 +100,14 @@ def test_a_damaged_set_of_failures_leaves_the_record_of_the_others(asked: Path, 
         config = load(Path("configs/tiny.yaml"))
         (failed,) = (one for one in failures_of(config.data, config.export) if one.name == "rlds")
         seen_by_dvc = failed.stage_record.read_bytes()
-        record = json.loads(seen_by_dvc)
+        write_inputs(Run(config))
+        assert json.loads((config.data / "settings.json").read_text())["lost"] == []
         next(failed.folder.rglob("*.tfrecord*")).write_bytes(b"damaged")
-        notice_changes(failed)
+        write_inputs(Run(config))
         assert not failed.record_file.exists()
-        assert failed.stage_record.read_bytes() != seen_by_dvc, "DVC starts the stage"
-        assert json.loads(failed.stage_record.read_text()) == record
+        # By this DVC starts the stage.
+        assert json.loads((config.data / "settings.json").read_text())["lost"] == ["failures/rlds.json"]
+        assert failed.stage_record.read_bytes() == seen_by_dvc
         assert {name for name in PARTS["rlds"].names if (config.data / name).exists()} == {
             "rlds",
             "rlds.json",
