@@ -2,10 +2,11 @@
 
     python tests/campaigns/kills.py [--kills 50] [--seed 0]
 
-Two folders get the same configuration. In the first folder, `dvc repro` runs undisturbed. In the second folder, SIGKILL
-kills it repeatedly, all stages equally often and after a sampled time. The victim is everything at once, the stage's
-process alone, or one of its workers; the run must survive the death of a worker. In the end both folders must hold the
-same files with the same bytes. No file that was complete at a kill may be generated again. The last line is JSON.
+Two folders get the same configuration. In the first folder, `python -m pipeline run` runs undisturbed. In the second
+folder, SIGKILL kills it repeatedly, all stages equally often and after a sampled time. The victim is everything at
+once, the run's own process alone, or one of its workers; the run must survive the death of a worker. In the end both
+folders must hold the same files with the same bytes. No file that was complete at a kill may be generated again. The
+last line is JSON.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -21,7 +23,6 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -31,14 +32,20 @@ if __name__ == "__main__":  # run as a script: with what the tests share
 
 # isort: split
 import psutil
-from conftest import IN_SCRIPTS, SCRIPTS, dvc, in_a_clone
+from conftest import IN_SCRIPTS, in_a_clone
 
 SURVIVES_S = 20.0
 """Time that a run continues after the death of a worker, before it is killed as well."""
 ALONE_S = 60.0
 """Time that processes may outlive their killed parent."""
 
-Victim = Literal["everything", "stage", "worker"]
+Victim = Literal["everything", "run", "worker"]
+
+BEGUN = re.compile(r"^\[\d+/\d+\] (\w+)$", re.MULTILINE)
+"""Line of a run's output at the beginning of a stage."""
+
+COMPUTE_FILES = ("configs/tiny.yaml", "data/tiny/.finished/doctor.json", "data/tiny/settings.json")
+"""Files of a clone that state how it was computed."""
 
 STARTER: dict[str, object] = {
     "name": "tiny",
@@ -58,17 +65,15 @@ class Killed:
     Attributes:
         kills: victim and running stage to the number of kills.
         runs: number of runs that ended and were started again, as kills were left.
-        locks: number of lock files that a killed DVC left broken; DVC refuses to start until they are deleted.
         faults: descriptions of the faults.
     """
 
     kills: Counter[str] = field(default_factory=Counter)
     runs: int = 0
-    locks: int = 0
     faults: list[str] = field(default_factory=list)
 
 
-def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float], target: str = "") -> Killed:
+def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float]) -> Killed:
     """Kill the run of a clone ``kills`` times, then let it end.
 
     Args:
@@ -76,17 +81,15 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
         kills: number of kills.
         seed: seed of victims and moments.
         took_s: duration of each stage that is to be killed; the moment is sampled from it.
-        target: the last stage to run (default: all stages run).
     """
     rng, result = random.Random(seed), Killed()
     whole: dict[Path, int] = {}
     due: set[str] = set()
     while (left := kills - result.kills.total()) > 0:
         due = due or set(rng.sample(sorted(took_s), min(left, len(took_s))))
-        result.locks += _without_broken_locks(clone)
-        run = _started(clone, target)
-        victim: Victim = rng.choice(("everything", "stage", "worker"))
-        for stage in _stages(run):
+        run = _started(clone)
+        victim: Victim = rng.choice(("everything", "run", "worker"))
+        for stage in _stages(run, clone):
             if stage in due:
                 due.remove(stage)
                 _wait(run, rng.uniform(0.0, took_s[stage]))
@@ -96,12 +99,10 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
             if run.returncode:
                 result.faults.append(f"the run ended with {run.returncode}")
                 return result
-            # DVC's own cache too; else DVC would restore the reports from it.
-            for folder in (clone / "data" / "tiny", clone / ".dvc" / "cache"):
-                shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(clone / "data" / "tiny", ignore_errors=True)
             whole, due = {}, set()
             continue
-        killed = _kill(run, victim)
+        killed = _kill(run, victim, _stage(clone))
         result.kills[killed] += 1
         if killed.startswith("worker"):
             _wait(run, SURVIVES_S)
@@ -111,8 +112,7 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
         stamps = {file: file.stat().st_mtime_ns for file in _stored(clone)}
         result.faults += [f"{file.name} was made again" for file, stamp in whole.items() if stamps.get(file) != stamp]
         whole = stamps
-    result.locks += _without_broken_locks(clone)
-    run = _started(clone, target)
+    run = _started(clone)
     if run.wait() != 0:
         result.faults.append(f"the last run ended with {run.returncode}")
     remade = [file.name for file, stamp in whole.items() if not file.exists() or file.stat().st_mtime_ns != stamp]
@@ -120,24 +120,14 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
     return result
 
 
-def _without_broken_locks(clone: Path) -> int:
-    """Delete those of DVC's two lock files that DVC cannot read, as setup.sh does; return their number."""
-    broken = [] if dvc(clone, "stage", "list").returncode == 0 else [clone / "dvc.lock"]
-    with suppress(FileNotFoundError):
-        users = clone / ".dvc" / "tmp" / "rwlock"
-        try:
-            json.loads(users.read_text())
-        except ValueError:
-            broken.append(users)
-    for file in broken:
-        file.unlink()
-    return len(broken)
-
-
-def _started(clone: Path, target: str = "") -> subprocess.Popen[bytes]:
-    with (clone.parent / f"{clone.name}.log").open("ab") as log:
-        command = [str(SCRIPTS / "dvc"), "repro", *filter(None, [target])]
+def _started(clone: Path) -> subprocess.Popen[bytes]:
+    with _log(clone).open("wb") as log:
+        command = [sys.executable, "-u", "-m", "pipeline", "run", "configs/tiny.yaml"]
         return subprocess.Popen(command, cwd=clone, env=IN_SCRIPTS, start_new_session=True, stdout=log, stderr=log)
+
+
+def _log(clone: Path) -> Path:
+    return clone.parent / f"{clone.name}.log"
 
 
 def _wait(run: subprocess.Popen[bytes], seconds: float) -> None:
@@ -146,47 +136,41 @@ def _wait(run: subprocess.Popen[bytes], seconds: float) -> None:
         time.sleep(0.02)
 
 
-def _stages(run: subprocess.Popen[bytes]) -> Iterator[str]:
+def _stages(run: subprocess.Popen[bytes], clone: Path) -> Iterator[str]:
     """Yield the name of each stage when it starts, until the run ends."""
-    last = ""
-    while run.poll() is None:
-        name = next((name for name, _ in _working(run)), "")
-        if name and name != last:
-            yield name
-        last = name
+    number = 0
+    while True:
+        ended = run.poll() is not None
+        begun = BEGUN.findall(_log(clone).read_text())
+        yield from begun[number:]
+        number = len(begun)
+        if ended:
+            return
         time.sleep(0.1)
 
 
-def _working(run: subprocess.Popen[bytes]) -> list[tuple[str, psutil.Process]]:
-    """Return the running stage and its process."""
-    with suppress(psutil.Error):
-        working: list[tuple[str, psutil.Process]] = []
-        for process in psutil.Process(run.pid).children(recursive=True):
-            words = _command(process)
-            if words[1:] and words[1].startswith("stages/"):
-                working.append((Path(words[1]).stem, process))
-        return working
-    return []
+def _stage(clone: Path) -> str:
+    """Return the name of the stage that began last."""
+    return (["start", *BEGUN.findall(_log(clone).read_text())])[-1]
 
 
-def watched(run: subprocess.Popen[bytes]) -> dict[str, float]:
+def watched(run: subprocess.Popen[bytes], clone: Path) -> dict[str, float]:
     """Measure the seconds of each stage of an undisturbed run."""
-    began = {name: time.monotonic() for name in _stages(run)}
+    began = {name: time.monotonic() for name in _stages(run, clone)}
     ended = [*began.values(), time.monotonic()][1:]
     return {name: end - start for (name, start), end in zip(began.items(), ended, strict=True)}
 
 
-def _kill(run: subprocess.Popen[bytes], victim: Victim) -> str:
+def _kill(run: subprocess.Popen[bytes], victim: Victim, stage: str) -> str:
     """Kill the victim, or everything if there is no such process; return the killed victim and the stage."""
-    working = _working(run)
-    stage = working[0][0] if working else "dvc"
-    below = psutil.Process(run.pid).children(recursive=True)
-    workers = [process for process in below if _is_worker(process)]
-    chosen = {"everything": [], "stage": [process for _, process in working], "worker": workers}[victim]
-    if not chosen:
+    workers = [process for process in psutil.Process(run.pid).children(recursive=True) if _is_worker(process)]
+    if victim == "worker" and workers:
+        workers[-1].kill()
+    elif victim == "run":
+        run.kill()
+    else:
         os.killpg(run.pid, signal.SIGKILL)
         return f"everything in {stage}"
-    chosen[-1].kill()
     return f"{victim} in {stage}"
 
 
@@ -271,7 +255,7 @@ def main() -> None:
             in_a_clone(STARTER, clone)
         start = time.monotonic()
         alone = _started(undisturbed)
-        took_s = watched(alone)
+        took_s = watched(alone, undisturbed)
         if alone.wait() != 0:
             raise SystemExit((folder / "undisturbed.log").read_text())
         alone_s = time.monotonic() - start
@@ -283,7 +267,6 @@ def main() -> None:
             "kills": result.kills.total(),
             "by_victim_and_stage": dict(sorted(result.kills.items())),
             "runs_begun_again": result.runs,
-            "dvc_locks_deleted": result.locks,
             "undisturbed_s": round(alone_s, 1),
             "with_kills_s": round(time.monotonic() - start - alone_s, 1),
             "faults": len(faults),
