@@ -151,7 +151,8 @@ def _stages(run: subprocess.Popen[bytes], clone: Path) -> Iterator[str]:
 
 def _stage(clone: Path) -> str:
     """Return the name of the stage that began last."""
-    return (["start", *BEGUN.findall(_log(clone).read_text())])[-1]
+    begun: list[str] = BEGUN.findall(_log(clone).read_text())
+    return begun[-1] if begun else "start"
 
 
 def watched(run: subprocess.Popen[bytes], clone: Path) -> dict[str, float]:
