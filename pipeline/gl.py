@@ -104,16 +104,20 @@ def check_device() -> None:
     Raises:
         PipelineError: when the first is not among the second.
     """
-    device, visible = os.environ.get("MUJOCO_EGL_DEVICE_ID"), os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    numbers = [number.strip() for number in visible.split(",")]
-    if device is None or not visible or (device.isdigit() and device in numbers):
+    device, visible = os.environ.get("MUJOCO_EGL_DEVICE_ID"), _visible_devices()
+    if device is None or not visible or (device.isdigit() and device in visible):
         return
-    named = [number for number in numbers if number.isdigit()]
+    named = [number for number in visible if number.isdigit()]
     raise PipelineError(
-        f"MUJOCO_EGL_DEVICE_ID={device} is not among CUDA_VISIBLE_DEVICES={visible}",
+        f"MUJOCO_EGL_DEVICE_ID={device} is not among CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']}",
         expected="one of its numbers, as robosuite renders on no other GPU",
         remedy=f"export MUJOCO_EGL_DEVICE_ID={named[0]}, or unset it" if named else "unset MUJOCO_EGL_DEVICE_ID",
     )
+
+
+def _visible_devices() -> list[str]:
+    """List the entries of ``CUDA_VISIBLE_DEVICES``; empty if the variable does not limit the GPUs."""
+    return [device.strip() for device in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if device.strip()]
 
 
 @functools.cache
@@ -126,11 +130,11 @@ def gpus() -> tuple[str, ...]:
     choice = choose()
     if choice.software or choice.device_named or choice.backend != "egl":
         return ()
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    if visible and not visible[0].isdigit():
+    visible = _visible_devices()
+    if not all(device.isdigit() for device in visible):
         return ()
     indices = []
-    for index in visible.split(",") if visible else map(str, count()):
+    for index in visible or map(str, count()):
         try:
             device = _probe("egl", index)
         except _NoDeviceError:

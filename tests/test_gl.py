@@ -132,6 +132,8 @@ def test_picks_the_egl_device(
         pytest.param({}, {"0": GPU, "1": GPU, "2": CPU}, ("0", "1"), id="all of a kind"),
         pytest.param({}, {"0": GPU, "1": "NVIDIA T4, 4.6.0", "2": GPU}, ("0", "2"), id="frames come from one kind"),
         pytest.param({"CUDA_VISIBLE_DEVICES": "2,3"}, dict.fromkeys("0123", GPU), ("2", "3"), id="the job's own"),
+        pytest.param({"CUDA_VISIBLE_DEVICES": "2, 3"}, dict.fromkeys("0123", GPU), ("2", "3"), id="with a space"),
+        pytest.param({"CUDA_VISIBLE_DEVICES": "0,GPU-8f"}, {"0": GPU, "1": GPU}, (), id="one not by number"),
         pytest.param({"CUDA_VISIBLE_DEVICES": "GPU-8f"}, {"0": GPU, "1": GPU}, (), id="not by numbers"),
         pytest.param({"MUJOCO_EGL_DEVICE_ID": "1"}, {"0": GPU, "1": GPU}, (), id="the one that is asked for"),
         pytest.param({}, {"0": CPU}, (), id="software"),
