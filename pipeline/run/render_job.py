@@ -64,7 +64,7 @@ class RenderJob:
         return self.row.demo_steps * len(self.streams)
 
     def limit_s(self) -> float:
-        """Return the time after which the job counts as hanging, in s: about twenty times that of frames without GPU."""
+        """Return the time after which the job counts as hanging, in s: about twenty times the time without a GPU."""
         return 1800.0 + 2.0 * self.frames_at_most()
 
     def lost(self) -> None:
