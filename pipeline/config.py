@@ -319,9 +319,9 @@ class Config(Frozen):
         return self.folder / self.name
 
 
-def _nested(one: Path, other: Path) -> bool:
+def _nested(first: Path, second: Path) -> bool:
     """Return whether two resolved paths are equal, or one is inside the other."""
-    return one.is_relative_to(other) or other.is_relative_to(one)
+    return first.is_relative_to(second) or second.is_relative_to(first)
 
 
 def load(path: Path) -> Config:

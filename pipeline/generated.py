@@ -43,7 +43,7 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
     A killed process leaves the old folder, the new one or none.
 
     Args:
-        made_from: as in ``Generated``.
+        made_from: see ``Generated``.
 
     Raises:
         PipelineError: if edits would be lost and ``REMAKE=1`` does not allow it; ``folder`` is then unchanged.
@@ -142,9 +142,9 @@ def edits_in_words(data: Path) -> Iterator[str]:
             yield f"edited in {data / name}: {words}. Before a run overwrites them, it stops: {REMEDY}"
 
 
-def in_words(found: Mapping[str, str]) -> str:
+def in_words(states: Mapping[str, str]) -> str:
     """Join paths and states, at most ``MAX_NAMED`` of them."""
-    named = [f"{path} ({how})" for path, how in sorted(found.items())]
+    named = [f"{path} ({state})" for path, state in sorted(states.items())]
     further = [f"and {len(named) - MAX_NAMED} more"] if len(named) > MAX_NAMED else []
     return ", ".join(named[:MAX_NAMED] + further)
 

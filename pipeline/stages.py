@@ -1,7 +1,7 @@
 """The stages of a run in order: from demonstrations to datasets, checks and reports.
 
-Each stage is a function of a ``Run``. ``perform`` calls one, unless its inputs and outputs are as they were after the
-last call. The command ``run`` performs all stages in one process; the scripts in ``stages/`` perform one, for DVC.
+Each stage is a function of a ``Run``. ``perform`` calls it, unless its inputs and outputs are unchanged since the last
+call. The command ``run`` performs all stages in one process; each script in ``stages/`` performs one stage, for DVC.
 """
 
 import argparse
@@ -96,7 +96,7 @@ def doctor(run: Run) -> None:
     try:
         tried = finished.of_doctor(run, gl.choose().device).holds()
     except (PipelineError, PackageNotFoundError):
-        # The table names what is missing.
+        # The table of `doctor.run` reports missing packages.
         tried = False
     if doctor.run(run, tried=tried):
         raise PipelineError(
@@ -147,7 +147,7 @@ def replay(run: Run) -> None:
     with run.workers() as workers:
         replays = Replays(config.demos, config.replay, run.trajectories.root, workers, config.filter)
         verdicts = replays.of(rows)
-    # Also the reserves that the stage render replayed because frames were rejected.
+    # Keep the reserves too that the stage `render` replayed because frames were rejected.
     run.trajectories.keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
     write_json(run.path(REPLAY), {"replayed": len(verdicts), "kept": kept})

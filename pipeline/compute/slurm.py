@@ -176,7 +176,7 @@ def _queued() -> set[str] | None:
 
 
 def _try(script: str) -> None:
-    """Have SLURM check a job without submitting it.
+    """Ask SLURM to check a job without submitting it.
 
     Raises:
         PipelineError: if SLURM rejects it, in SLURM's words.

@@ -22,7 +22,7 @@ def local_cluster(workers: int | None, renders: bool) -> Iterator[tuple[Any, Cal
 
     Args:
         workers: number of workers; one for each core if `None`.
-        renders: as in ``runner``.
+        renders: True if the work renders, see ``runner``.
 
     Raises:
         PipelineError: when the workers end while they start.
@@ -91,7 +91,7 @@ def _ended(cluster: Any) -> Iterator[Any]:
 
 
 def _have_rendered_alike(client: Any) -> None:
-    """Have each worker of this machine, later ones included, render with the device of this process."""
+    """Make each worker of this machine, later ones included, render with the device of this process."""
     from distributed import Worker, WorkerPlugin
 
     prepare = gl.WorkerSetup()

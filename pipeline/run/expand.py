@@ -191,7 +191,7 @@ class _Motion:
     """Measures by which candidates are compared.
 
     Attributes:
-        smoothness: as ``quality.smoothness`` returns it.
+        smoothness: result of ``quality.smoothness``.
         joints_rad: (7,) start of the arm.
         objects_m: (N, 3) start positions of the objects.
     """

@@ -161,13 +161,13 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
         _options(target),
         target.extras,
         [[piece.path, piece.ids] for piece in target.pieces(episodes)],
-        [known.content for known in episodes.known.values()],
+        [episode.content for episode in episodes.known.values()],
     )[:16]
 
 
 def request(target: AnyFormat, episodes: Episodes) -> str:
     """Return a short digest of the requested part of ``identity``: the episodes with their content, and the options."""
-    content = [known.content for known in episodes.known.values()]
+    content = [episode.content for episode in episodes.known.values()]
     return digest(_options(target), target.extras, content)[:16]
 
 

@@ -43,7 +43,7 @@ AnyFormat = Format[Any]
 
 
 class Run:
-    """One run: its configuration, the paths in its folder, and what is stored there.
+    """One run: its configuration, the paths in its folder, and the stored files.
 
     Stores and outcome are opened at first use, and kept. Plan and manifest are read again when their file has changed.
     Each stage or command gets its own ``Run``.

@@ -30,7 +30,7 @@ LOCK = ".lock"
 
 
 class Mark(NamedTuple):
-    """What a run's folder states about its configuration file.
+    """Mark of a run's folder, which states its configuration file.
 
     Attributes:
         file: absolute path of the configuration file.
@@ -163,18 +163,18 @@ def _refuse_other_owner(config: Config, file: Path) -> None:
     mark = _mark(folder)
     if mark is None or mark.file == file.resolve():
         return
-    this, other = _shown(file.resolve(), mark.file)
+    this, owner = _shown(file.resolve(), mark.file)
     adopt = f'to have the folder belong to {this}, write {{"configuration": "{this}"}} into {folder / OWNER}'
     if mark.file.exists():
         raise PipelineError(
-            f"the folder belongs to {other}, and {this} has the same name: {config.name}",
+            f"the folder belongs to {owner}, and {this} has the same name: {config.name}",
             where=folder,
             expected="a folder for each configuration file, as a run deletes what it did not plan",
             remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
         )
     if mark.content != _content(file):
         raise PipelineError(
-            f"the folder belongs to {other}, which is not there, and {this} has another content",
+            f"the folder belongs to {owner}, which is not there, and {this} has another content",
             where=folder,
             expected="the content of the last run, where a folder or a configuration file was moved",
             remedy=f"change `name:` in {this}, or `folder:`; {adopt}",

@@ -32,7 +32,7 @@ class Shown:
     """Record of one trajectory's stored frames, in all its files.
 
     Attributes:
-        made_by, device, replay_mode: as in the table.
+        made_by, device, replay_mode: values of the table's columns.
         streams: ids of the rendered streams.
         rejected: id of each rejected stream to the reason.
     """

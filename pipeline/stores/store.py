@@ -222,9 +222,9 @@ class Store(ABC):
         if self._known().keys() - {self.made_by} and len(rows) == len(self.names()):
             self._write(rows, {self.made_by: self._made_with})
 
-    def _write(self, rows: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]) -> None:
+    def _write(self, rows: Mapping[str, Mapping[str, Any]], made_with_of: Mapping[str, Any]) -> None:
         listed = [row for _, row in sorted(rows.items())]
-        schema = self._schema.with_metadata({_MADE_WITH: json.dumps(known, sort_keys=True)})
+        schema = self._schema.with_metadata({_MADE_WITH: json.dumps(made_with_of, sort_keys=True)})
         write_table(pa.Table.from_pylist(listed, schema=schema), self.root / TABLE)
 
     def _known(self) -> dict[str, dict[str, Any]]:
