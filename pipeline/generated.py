@@ -142,9 +142,9 @@ def edits_in_words(data: Path) -> Iterator[str]:
             yield f"edited in {data / name}: {words}. Before a run overwrites them, it stops: {REMEDY}"
 
 
-def in_words(states: Mapping[str, str]) -> str:
+def in_words(found: Mapping[str, str]) -> str:
     """Join paths and states, at most ``MAX_NAMED`` of them."""
-    named = [f"{path} ({state})" for path, state in sorted(states.items())]
+    named = [f"{path} ({state})" for path, state in sorted(found.items())]
     further = [f"and {len(named) - MAX_NAMED} more"] if len(named) > MAX_NAMED else []
     return ", ".join(named[:MAX_NAMED] + further)
 

@@ -73,10 +73,10 @@ def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
     return {axis: Target(number, planned[axis], kept[axis]) for axis, number in wanted.items()}
 
 
-def shortfalls(target_of: Mapping[str, Target]) -> list[str]:
+def shortfalls(found: Mapping[str, Target]) -> list[str]:
     """Write a sentence for each axis that has fewer kept episodes than wanted, with the setting that helps."""
     sentences = []
-    for axis, target in target_of.items():
+    for axis, target in found.items():
         if axis == CLEAN or target.kept >= target.wanted:
             continue
         if target.planned < target.wanted:
