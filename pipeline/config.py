@@ -1,4 +1,4 @@
-"""The typed configuration: one file is one run, a section per stage; what it does not say has a default."""
+"""Typed configuration: one file is one run, with a section per stage; fields that are left out have defaults."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CHECKOUT = (
     *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),
     *("tasks", "tests"),
 )
-"""Folders of a checkout that no run may use: those that git tracks, its own and that of the packages, own tasks."""
+"""Folders of a checkout that no run may use: tracked folders, git's folder, the packages and the user's own tasks."""
 
 
 class DemosConfig(Frozen):
@@ -63,19 +63,20 @@ class DemosConfig(Frozen):
         return StarterSource() if self.root is None else HDF5Source(self.root)
 
     def index(self) -> DemoIndex:
-        """The demonstrations that a run starts from, and those that cannot be used."""
+        """Return the demonstrations that a run starts from, and the demonstrations that cannot be used."""
         return self.open().index(select_tasks(self.tasks), self.per_task)
 
     def refuse_tasks_without(self, entries: Sequence[DemoEntry]) -> None:
-        """Refuse a chosen task without any of ``entries``.
+        """Reject a chosen task without any of ``entries``.
 
-        Other tasks would be planned in its place, and what was finished of it deleted.
+        Other tasks would be planned in its place, and its finished work would be deleted.
 
         Raises:
             PipelineError: naming the tasks.
         """
         usable = {entry.task for entry in entries}
-        if without := [str(task) for task in select_tasks(self.tasks) if task not in usable]:
+        without = [str(task) for task in select_tasks(self.tasks) if task not in usable]
+        if without:
             raise PipelineError(
                 f"{len(without)} of the chosen tasks have no usable demonstration: {', '.join(without)}",
                 where=self.root,
@@ -106,8 +107,10 @@ class PlanConfig(Frozen):
         axes = raw.get("axes", {}) if isinstance(raw, Mapping) else None
         if not isinstance(axes, Mapping) or not isinstance(raw.get("episodes"), Mapping):
             return raw
-        drawn = {axis for name in raw["episodes"] for axis in str(name).split("+") if axis in AXES}
-        return {**raw, "axes": {axis: {} for axis in drawn} | dict(axes)}
+        named: set[str] = set()
+        for name in raw["episodes"]:
+            named.update(axis for axis in str(name).split("+") if axis in AXES)
+        return {**raw, "axes": {axis: {} for axis in named} | dict(axes)}
 
     @field_validator("episodes")
     @classmethod
@@ -122,17 +125,25 @@ class PlanConfig(Frozen):
 
     @model_validator(mode="after")
     def _axes_match_episodes(self) -> PlanConfig:
-        named, drawn = {*self.axes.drawn()}, {axis for name in self.episodes for axis in axes_of(name)}
-        for axis in sorted(named ^ drawn):
-            section, other = ("axes", "episodes") if axis in named else ("episodes", "axes")
-            raise ValueError(f"axes and episodes must name the same axes: {axis} is in {section}, but not in {other}")
+        in_axes = {*self.axes.drawn()}
+        in_episodes: set[str] = set()
+        for name in self.episodes:
+            in_episodes.update(axes_of(name))
+        for axis in sorted(in_axes ^ in_episodes):
+            section, lacking = ("axes", "episodes") if axis in in_axes else ("episodes", "axes")
+            raise ValueError(f"axes and episodes must name the same axes: {axis} is in {section}, but not in {lacking}")
         for name in self.episodes:
             self.drawn_from(name)
         return self
 
     def drawn_from(self, name: str) -> tuple[Axis, ...]:
-        """What the episodes called ``name`` draw from, one axis after the other; ValueError as of ``Axis.beside``."""
-        return tuple(self.axes.drawn()[axis].beside(axes_of(name)) for axis in axes_of(name))
+        """Return the axes that the episodes called ``name`` sample from.
+
+        Raises:
+            ValueError: as ``Axis.beside``.
+        """
+        axes = axes_of(name)
+        return tuple(self.axes.drawn()[axis].beside(axes) for axis in axes)
 
 
 class ReplayConfig(Frozen):
@@ -176,9 +187,10 @@ class FilterConfig(Frozen):
     exceeds_step_limit: Literal["drop"] | None = None
 
     def fault(self, quality: Mapping[str, Any]) -> str | None:
-        """Return the first column of ``Quality`` whose figure is refused."""
+        """Return the first column of ``Quality`` whose figure is rejected, `None` if there is none."""
         for name, limit in self.model_dump(exclude_none=True, exclude={"exceeds_step_limit"}).items():
-            if quality[name] < limit if name == "joint_margin_rad" else quality[name] > limit:
+            rejected = quality[name] < limit if name == "joint_margin_rad" else quality[name] > limit
+            if rejected:
                 return name
         return None
 
@@ -205,7 +217,7 @@ class Config(Frozen):
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=LONGEST_NAME)
-    # Left out where it says nothing, so that what was finished before there was the field stays what it is.
+    # The default is left out, so that runs that were finished before the field existed stay up to date.
     folder: Place = Field(default=Path("data"), exclude_if=lambda folder: folder == Path("data"))
     demos: DemosConfig = DemosConfig()
     plan: PlanConfig
@@ -224,15 +236,16 @@ class Config(Frozen):
         except PipelineError as error:
             of_file = f"{error.where}: " if error.where else ""
             raise ValueError(f"tasks: {of_file}{error.what}, expected {error.expected}") from error
-        for own_task in (task for task in chosen if task.suite not in SUITES):
+        own_tasks = [task for task in chosen if task.suite not in SUITES]
+        for own_task in own_tasks:
             for kind, name in (("suite", own_task.suite), ("task", own_task.name)):
                 if len(name) > LONGEST_NAME:
                     raise ValueError(
                         f"tasks: the name of the {kind} {name} has {len(name)} characters, expected at most "
                         f"{LONGEST_NAME}, as paths of datasets contain it: rename it"
                     )
-        if demos.root is None and (own := next((task for task in chosen if task.suite not in SUITES), None)):
-            raise ValueError(f"the starter set has no demonstration of {own}: set root")
+        if demos.root is None and own_tasks:
+            raise ValueError(f"the starter set has no demonstration of {own_tasks[0]}: set root")
         return demos
 
     @field_validator("export")
@@ -256,22 +269,31 @@ class Config(Frozen):
                 "recorded actions do not work against pushes: disturbance goes with replay.mode: auto or tracked"
             )
         if axes.language:
-            # LIBERO-90 has no rewrites among those that are shipped.
-            banks = [load_bank(), *([load_bank(axes.language.bank)] if axes.language.bank else [])]
-            without = [str(t) for t in chosen if not any(b.get(t.suite, {}).get(t.name) for b in banks)]
+            # The shipped bank has no rewrites of LIBERO-90.
+            banks = [load_bank()]
+            if axes.language.bank:
+                banks.append(load_bank(axes.language.bank))
+            without = []
+            for task in chosen:
+                if not any(bank.get(task.suite, {}).get(task.name) for bank in banks):
+                    without.append(str(task))
             if without:
                 raise ValueError(
                     f"plan.axes.language: no rewrites of {len(without)} tasks, such as {without[0]}; leave language "
                     "out, leave them out of demos.tasks, or name a bank that has some (the command rewrite makes one)"
                 )
-        known = {
+        components = {CLEAN}
+        for axis in axes.drawn():
+            components.update(components_of(axis))
+        values_of_run = {
             "axis": {CLEAN, *self.plan.episodes},
-            "component": {CLEAN, *(component for axis in axes.drawn() for component in components_of(axis))},
+            "component": components,
             "suite": {task.suite for task in chosen},
         }
-        for field, names in known.items():
-            if unknown := [name for name in getattr(self.export.where, field, None) or () if name not in names]:
-                raise ValueError(f"export.where.{field}: the run has no {unknown[0]!r}, expected of {sorted(names)}")
+        for field, values in values_of_run.items():
+            for value in getattr(self.export.where, field, None) or ():
+                if value not in values:
+                    raise ValueError(f"export.where.{field}: the run has no {value!r}, expected of {sorted(values)}")
         return self
 
     @model_validator(mode="after")
@@ -279,9 +301,9 @@ class Config(Frozen):
         """Reject a run's folder in which stages would delete files that are not of the run."""
         data = self.data.resolve()
         for root in {Path.cwd(), Path(__file__).resolve().parents[1]}:
-            own = next((root / name for name in CHECKOUT if _nested(data, (root / name).resolve())), None)
-            if own or root.is_relative_to(data):
-                raise ValueError(f"folder: {data} is, is in or contains the folder {own or root} of the checkout")
+            nested = next((root / name for name in CHECKOUT if _nested(data, (root / name).resolve())), None)
+            if nested or root.is_relative_to(data):
+                raise ValueError(f"folder: {data} is, is in or contains the folder {nested or root} of the checkout")
         if Path.home().resolve().is_relative_to(data):
             raise ValueError(f"folder: {data} is or contains the home folder")
         for shared in (texture_sources.FOLDER, object_sources.FOLDER, benchmark.FOLDER):
@@ -293,34 +315,34 @@ class Config(Frozen):
 
     @property
     def data(self) -> Path:
-        """The folder that everything this run makes lies in."""
+        """Folder of all files that this run generates."""
         return self.folder / self.name
 
 
-def _nested(one: Path, other: Path) -> bool:
+def _nested(first: Path, second: Path) -> bool:
     """Return whether two resolved paths are equal, or one is inside the other."""
-    return one.is_relative_to(other) or other.is_relative_to(one)
+    return first.is_relative_to(second) or second.is_relative_to(first)
 
 
 def load(path: Path) -> Config:
     """Read and validate a configuration.
 
     Raises:
-        PipelineError: naming the file, every field that is wrong, and what would have worked.
+        PipelineError: naming the file, every wrong field, and valid values.
     """
-    origins.check_module("libero")  # Tasks are looked up in its list.
+    origins.check_module("libero")  # It has the list of tasks.
     try:
         return Config.model_validate(yaml.load(path.read_text(encoding="utf-8"), StrictLoader))
     except (OSError, UnicodeDecodeError) as error:
-        there = sorted(map(str, Path("configs").glob("*")))
-        raise PipelineError(f"cannot read the configuration ({error})", where=path, remedy=f"one of {there}") from error
+        files = sorted(map(str, Path("configs").glob("*")))
+        raise PipelineError(f"cannot read the configuration ({error})", where=path, remedy=f"one of {files}") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise PipelineError(f"not valid YAML: {error}", where=path, expected="a file like those of configs/") from error
     except ValidationError as error:
-        faults = [
-            f"{'.'.join(map(str, fault['loc'])) or 'top level'}: {fault['msg']} (got {reprlib.repr(fault['input'])})"
-            for fault in error.errors()
-        ]
+        faults = []
+        for fault in error.errors():
+            field = ".".join(map(str, fault["loc"])) or "top level"
+            faults.append(f"{field}: {fault['msg']} (got {reprlib.repr(fault['input'])})")
         raise PipelineError(
             "the configuration is not valid:\n    " + "\n    ".join(faults),
             where=path,

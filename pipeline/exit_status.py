@@ -1,4 +1,4 @@
-"""How a command ends: with a status, and with words that a person can act on in place of a traceback."""
+"""End of a command: an exit status, and a message with a remedy in place of a traceback."""
 
 import errno
 import signal
@@ -25,18 +25,18 @@ SURROUNDINGS = {
     errno.EMFILE: ("too many files are open", f"raise the limit (`ulimit -n 4096`), and {GO_ON}"),
     errno.EIO: ("the disk has an error", "`python -m pipeline check` says which files are whole"),
 }
-"""What the machine refuses, and what to do about it. Any other fault is one of this project, with its traceback."""
+"""Error number of the system to its description and remedy. All other errors are bugs and keep their traceback."""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM: the machine shuts down, or a scheduler's time is over."""
+    """Interruption by SIGTERM: the machine shuts down, or a scheduler's time limit is over."""
 
 
 def exit_status(command: Callable[[], int]) -> int:
-    """Call a command, and say on the standard error why it ended early.
+    """Call a command, and print to the standard error why it ended early.
 
     Returns:
-        Its own status; 1 for an error; 130 and 143 where it was stopped by SIGINT (Ctrl-C) and SIGTERM.
+        The command's status; 1 for an error; 130 after SIGINT (Ctrl-C) and 143 after SIGTERM.
     """
     try:
         with _terminated():
@@ -63,7 +63,7 @@ def _told(message: str, status: int) -> int:
 @contextmanager
 def _terminated() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
-        # Only once: what is closed on the way out may take its time.
+        # Ignore further signals, as closing files and workers may take time.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise Terminated
 

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there."""
+"""Files that are either whole or missing."""
 
 import json
 import os
@@ -16,14 +16,14 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 
 
 def schema_file(name: str) -> Path:
-    """A file of ``schemas/``: beside the library in a checkout, inside of it in an installed wheel."""
+    """Return the path of a file of ``schemas/``: next to the library in a checkout, inside it in an installed wheel."""
     package = Path(__file__).resolve().parent
     inside = package / "schemas" / name
     return inside if inside.exists() else package.parent / "schemas" / name
 
 
 class Edition(NamedTuple):
-    """One content of a file, for what is kept in memory of it: another content at the same path is another edition."""
+    """One content of a file, as a key for caches: another content at the same path is another edition."""
 
     path: Path
     inode: int
@@ -32,20 +32,20 @@ class Edition(NamedTuple):
 
 
 def edition(path: Path) -> Edition:
-    """The file as it lies there now; its path absolute.
+    """Return the present edition of a file, with an absolute path.
 
     Raises:
-        OSError: when it is not there.
+        OSError: when the file is missing.
     """
     status = path.stat()
     return Edition(path.absolute(), status.st_ino, status.st_size, status.st_mtime_ns)
 
 
 def checksum(file: Path) -> str:
-    """SHA-256 of a file's content, as ``sha256sum`` prints it.
+    """Return the SHA-256 of a file's content, as ``sha256sum`` prints it.
 
     Raises:
-        OSError: when it cannot be read.
+        OSError: when the file cannot be read.
     """
     with file.open("rb") as content:
         return file_digest(content, "sha256").hexdigest()
@@ -53,15 +53,15 @@ def checksum(file: Path) -> str:
 
 @cache
 def checksum_of(version: Edition) -> str:
-    """``checksum`` of a file as it lay there, computed once a process."""
+    """Return the ``checksum`` of an edition of a file, computed once per process."""
     return checksum(version.path)
 
 
 def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
-    """A JSON object that a stage wrote.
+    """Read a JSON object that a stage wrote.
 
     Raises:
-        PipelineError: when the file is missing, or is something else.
+        PipelineError: when the file is missing, damaged or no JSON object.
     """
     try:
         content = json.loads(file.read_bytes())
@@ -77,18 +77,18 @@ def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
 
 
 def write_json(file: Path, content: object) -> None:
-    """Write what ``read_json`` reads; the file is whole or not there."""
+    """Write a file that ``read_json`` reads; it is whole or missing."""
     write(file, json.dumps(content, indent=1) + "\n")
 
 
 def write(file: Path, content: str | bytes) -> None:
-    """Write a file, text as UTF-8; it is whole or not there."""
+    """Write a file, text as UTF-8; it is whole or missing."""
     with replaced(file) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def refuse_other_file(path: Path, mark: str) -> None:
-    """Reject a file that a command would overwrite and that it has not written itself.
+    """Reject a file that a command would overwrite and did not write itself.
 
     Args:
         mark: text that all files of the command contain.
@@ -108,11 +108,11 @@ def refuse_other_file(path: Path, mark: str) -> None:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; on success it is synced to disk and takes the place of ``path``.
+    """Yield a temporary path next to ``path``; on success sync it to disk and rename it to ``path``.
 
-    Works for a file and for a folder. When the block raises, what was at ``path`` before is untouched. The temporary
-    name is drawn anew each time: two hosts that share a file system have processes with the same number, and one may
-    do the work of the other again while that still writes.
+    Works for a file and for a folder. When the block raises, the content of ``path`` is unchanged. The temporary name
+    is random, as two hosts that share a file system have processes with equal numbers. One host may repeat the work of
+    the other while that host still writes.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
@@ -124,7 +124,7 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def put_in_place(whole: Path, path: Path) -> None:
-    """Sync a file or a folder of the same file system to disk, and give it the place of what is at ``path``."""
+    """Sync a file or a folder of the same file system to disk, and replace ``path`` with it."""
     sync(whole)
     path.parent.mkdir(parents=True, exist_ok=True)
     if whole.is_dir():
@@ -135,7 +135,7 @@ def put_in_place(whole: Path, path: Path) -> None:
 
 @contextmanager
 def scratch(folder: Path) -> Iterator[Path]:
-    """An empty folder, removed at the end; its name is fixed, so that what a killed run left in it goes now."""
+    """Yield an empty folder, removed at the end; its name is fixed, so leftovers of a killed run are removed first."""
     remove(folder)
     folder.mkdir(parents=True)
     try:
@@ -146,7 +146,7 @@ def scratch(folder: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Have a file, or a folder with everything in it, on disk."""
+    """Sync a file, or a folder with its whole content, to disk."""
     for entry in (*path.rglob("*"), path):
         _sync(entry)
 
@@ -160,12 +160,12 @@ def _sync(path: Path) -> None:
 
 
 def keep_below(folder: Path, files: set[Path], made: Callable[[Path], bool] = lambda path: True) -> None:
-    """Delete every file below ``folder`` that is none of ``files``, nor inside one of them, and the folders left empty.
+    """Delete every file below ``folder`` that is neither one of ``files`` nor inside one, then delete empty folders.
 
-    Such as shards of an earlier plan, and temporaries of a killed run.
+    Deleted files are, for example, shards of an earlier plan, and temporaries of a killed run.
 
     Args:
-        made: returns whether the program made a file. Other files stay.
+        made: returns True if this project wrote a file. All other files stay.
     """
     if not folder.is_dir():
         return
@@ -190,10 +190,10 @@ def is_temporary(name: str, of: str | None = None) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what ``replaced`` left beside a folder's files where its process was killed.
+    """Delete temporaries that killed processes left in a folder during ``replaced``.
 
-    Only for who holds a lock that keeps all others, on every host, from writing there: a name does not say whether its
-    process still lives on another host.
+    The caller must hold a lock that keeps all other processes, on every host, from writing to the folder. The name of a
+    temporary does not show if its process still lives on another host.
     """
     for entry in folder.glob(".*.tmp"):  # Nothing if the folder does not exist.
         if is_temporary(entry.name):
@@ -201,7 +201,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _discard(temporary: Path) -> None:
-    """Delete what other workers may still be writing into: the rest goes next time (``remove_leftovers``)."""
+    """Delete a temporary, even while other workers write into it; ``remove_leftovers`` deletes the rest later."""
     if temporary.is_dir():
         shutil.rmtree(temporary, ignore_errors=True)
     else:
@@ -214,7 +214,7 @@ def remove_if_empty(folder: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Delete a file or a folder, if it is there."""
+    """Delete a file or a folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

@@ -43,7 +43,7 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
     A killed process leaves the old folder, the new one or none.
 
     Args:
-        made_from: as in ``Generated``.
+        made_from: see ``Generated``.
 
     Raises:
         PipelineError: if edits would be lost and ``REMAKE=1`` does not allow it; ``folder`` is then unchanged.
@@ -75,7 +75,7 @@ def record(folder: Path) -> Generated:
 
 
 def edits(folder: Path) -> dict[str, str]:
-    """List the files that are not as the folder's record has them.
+    """List the files that differ from the folder's record.
 
     Returns:
         Path below the folder to ``changed``, ``added``, ``a link`` or ``without a record``. A deleted file is no edit:
@@ -88,22 +88,22 @@ def edits(folder: Path) -> dict[str, str]:
         unknown = "added"
     except PipelineError:
         recorded, unknown = {}, "without a record"
-    found: dict[str, str] = {}
+    states: dict[str, str] = {}
     for path, file in _files(folder).items():
         if file.is_symlink():
-            found[path] = "a link"
+            states[path] = "a link"
         elif path not in recorded:
-            found[path] = unknown
+            states[path] = unknown
         elif not file.is_file() or checksum(file) != recorded[path]:
-            found[path] = "changed"
-    return found
+            states[path] = "changed"
+    return states
 
 
 def unchanged(folder: Path, below: str = "") -> dict[str, Path]:
     """Return the recorded files of a folder if they are all that it has.
 
     Args:
-        below: subfolder to look at, such as ``rlds`` of ``card``; all of the folder when left out.
+        below: subfolder to check, such as ``rlds`` of ``card``; by default the whole folder.
 
     Returns:
         Path below the folder to file.
@@ -134,21 +134,23 @@ REMEDY = (
 
 
 def edits_in_words(data: Path) -> Iterator[str]:
-    """Say which generated folders of a run have edits, one sentence each."""
+    """Yield a sentence for each generated folder of a run that has edits."""
     for name in FOLDERS:
-        if found := edits(data / name):
-            yield f"edited in {data / name}: {in_words(found)}. Before a run overwrites them, it stops: {REMEDY}"
+        edits_of_folder = edits(data / name)
+        if edits_of_folder:
+            words = in_words(edits_of_folder)
+            yield f"edited in {data / name}: {words}. Before a run overwrites them, it stops: {REMEDY}"
 
 
 def in_words(found: Mapping[str, str]) -> str:
     """Join paths and states, at most ``MAX_NAMED`` of them."""
-    named = [f"{path} ({how})" for path, how in sorted(found.items())]
+    named = [f"{path} ({state})" for path, state in sorted(found.items())]
     further = [f"and {len(named) - MAX_NAMED} more"] if len(named) > MAX_NAMED else []
     return ", ".join(named[:MAX_NAMED] + further)
 
 
 def _refuse_loss(folder: Path, files: Mapping[str, str]) -> None:
-    """Stop if edits would be lost, by which the files to come differ from those in the folder."""
+    """Stop if edits would be lost: edited files that differ from the new files."""
     lost: dict[str, str] = {}
     for path, how in edits(folder).items():
         file = folder / path
@@ -170,10 +172,10 @@ def _refuse_loss(folder: Path, files: Mapping[str, str]) -> None:
 
 def _files(folder: Path) -> dict[str, Path]:
     """Map paths to files and links below a folder: hidden ones too, without the record and compiled Python."""
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for file in sorted(folder.rglob("*")):
         path = file.relative_to(folder)
         compiled = path.parent.name == "__pycache__" and path.suffix == ".pyc"
         if (file.is_symlink() or not file.is_dir()) and not compiled and path != Path(RECORD):
-            found[path.as_posix()] = file
-    return found
+            files[path.as_posix()] = file
+    return files

@@ -1,15 +1,16 @@
-"""What decides whether finished work is current; DVC decides only which stages start.
+"""Identity of finished work, which decides if the work is up to date; DVC decides only which stages start.
 
-1. A step makes files from inputs: physics makes trajectories, pixels makes frames, encoding makes files of frames.
-2. What a file was made with has three parts: recipe numbers, package versions, and the processor's machine code.
-3. A recipe is a number in ``RECIPES``. Raise it in the commit that changes what the step makes, and only then.
-4. ``golden.json`` of the tests has what each number makes of short inputs; a test fails when only one of both changes.
+1. A step generates files from inputs: physics generates trajectories, pixels frames, and encoding files of frames.
+2. A file is made with three things: recipe numbers, package versions, and the processor's machine code.
+3. A recipe is a number in ``RECIPES``. Raise it in the commit that changes the results of the step, and only then.
+4. ``golden.json`` of the tests has the results of each number for short inputs. A test fails if only one of both
+   changes.
 5. ``PACKAGES`` names the packages that compute a step. This project's own version is not among them.
-6. A step that builds on others (``AFTER``) has their recipes and packages too.
-7. The fingerprint of a file is a digest of all this and of the settings that its bytes depend on.
-8. A file is named after its inputs, and current when it has today's fingerprint. Else it counts as missing.
-9. A stage whose outputs are few (an export, ``validate``, ``summary``) has one fingerprint, of all its inputs.
-10. Before finished files of today's plan are made anew, a person must have allowed it (``refuse_unasked``).
+6. A step that builds on other steps (``AFTER``) includes their recipes and packages.
+7. The fingerprint of a file is a digest of recipes, packages, machine code and the settings that its bytes depend on.
+8. A file is named after its inputs, and is up to date if it has today's fingerprint. Else it counts as missing.
+9. A stage with few outputs (an export, ``validate``, ``summary``) has one fingerprint, of all its inputs.
+10. Before finished files of today's plan are generated again, a person must allow it (``refuse_unasked``).
 """
 
 import os
@@ -38,13 +39,14 @@ RECIPES: dict[Step, int] = {
     "checks": 8,
     "pictures": 6,
 }
-"""What a number stands for, the commit tells that raised it.
+"""Recipe number of each step; the commit that raised a number describes the change.
 
-``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
-``pictures``: what ``summary`` shows, and the report."""
+``evaluation`` covers an episode's start, its limit and the observations of a policy. ``checks`` covers the findings of
+``validate``, and ``pictures`` covers the pictures of ``summary`` and the report.
+"""
 
 MAPS_RECIPE = 2
-"""The recipe of depth and segmentation; only the files of runs that ask for them depend on it."""
+"""Recipe of depth and segmentation; only the files of runs with these extras depend on it."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),
@@ -52,7 +54,7 @@ AFTER: dict[Step, tuple[Step, ...]] = {
     "checks": ("physics", "pixels", "encoding"),
     "pictures": ("physics", "pixels", "encoding"),
 }
-"""The steps that a step computes again or reads the files of; an export has its episodes' fingerprints as inputs."""
+"""Steps that a step computes again, or whose files it reads; an export's inputs include its episodes' fingerprints."""
 
 PACKAGES: dict[Step, tuple[str, ...]] = {
     "physics": (
@@ -74,10 +76,10 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
 }
 
 DISTRIBUTION = "perturbed-demos"
-"""This project among installed packages: on PyPI, ``pipeline`` is the name of another."""
+"""Name of this project among installed packages; on PyPI, ``pipeline`` is another project."""
 
 REMAKE = "REMAKE"
-"""Variable of the environment that allows to make finished files anew: ``REMAKE=1`` before the command."""
+"""Environment variable that allows to generate finished files again: ``REMAKE=1`` before the command."""
 
 VERSIONS = {
     "pipeline": "this project",
@@ -88,69 +90,67 @@ VERSIONS = {
     "numba": "compiled controller code",
     "opencv-python-headless": "noise and JPEG encoding",
 }
-"""The packages that the manifest has a column for, and what they are for."""
+"""Packages with a column in the manifest, and their purposes."""
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Package name to version, for the packages of ``VERSIONS``."""
+    """Map the packages of ``VERSIONS`` to their installed versions."""
     return {name: version(DISTRIBUTION if name == "pipeline" else name) for name in VERSIONS}
 
 
 def made_with(step: Step) -> dict[str, str]:
-    """What files of a step are made with, by name, for people: recipes, package versions and ``fixed_machine_code``."""
+    """Map names for people to the recipes, package versions and ``fixed_machine_code`` of a step's files."""
     recipes, packages, machine_code = _parts(step)
     named = {f"recipe of {each}": str(number) for each, number in recipes.items()}
     return {**named, **packages, "machine code": machine_code}
 
 
 def fingerprint(step: Step, *settings: object) -> str:
-    """A short name for what makes the files of a step, 16 hex digits.
+    """Return the fingerprint of a step's files, 16 hex digits.
+
+    It is a digest of recipes, packages, machine code and settings.
 
     Args:
-        step: the last step of the file; those that it builds on count as well.
-        settings: JSON-serialisable, what else the bytes depend on.
+        step: last step of the file; steps that it builds on count too.
+        settings: JSON-serialisable settings that the bytes depend on.
 
     Raises:
-        PipelineError: when NumPy computes with other machine code than is fixed, or a clone is imported in place of
-            a package.
+        PipelineError: when NumPy's machine code is not the fixed one, or a clone is imported in place of a package.
     """
     return digest(_parts(step), *settings)[:16]
 
 
 def differences(then: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """In words, what differs of two ``made_with``; empty where nothing does."""
+    """Describe the differences of two ``made_with`` in words; empty if they are equal."""
     names = dict.fromkeys([*then, *now])
-    return ", ".join(
-        f"{name} {then.get(name, 'none')}, here {now.get(name, 'none')}"
-        for name in names
-        if then.get(name) != now.get(name)
-    )
+    changed = [name for name in names if then.get(name) != now.get(name)]
+    return ", ".join(f"{name} {then.get(name, 'none')}, here {now.get(name, 'none')}" for name in changed)
 
 
 ALLOW = f"`{REMAKE}=1` before the command, or --remake behind one stage's"
-"""How a person allows it for what a stage makes."""
+"""Ways to allow that a stage generates finished files again, in words."""
 
 
 def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
-    """Say what is made anew, and stop unless that was asked for.
+    """Report the finished files that would be generated again, and stop unless a person allowed it.
 
     Args:
-        found: what and why, to the number of files.
-        where: they lie.
-        allow: how, in words.
+        found: kind of files and reason, to the number of files.
+        where: folder of the files.
+        allow: ways to allow it, in words.
 
     Raises:
-        PipelineError: when there is any, and the environment does not allow it. Nothing was changed.
+        PipelineError: when there are such files, and the environment does not allow it. Nothing was changed.
     """
     if not found:
         return
-    told = "; ".join(f"{number} {what}" for what, number in found.items())
+    outdated = "; ".join(f"{number} {kind}" for kind, number in found.items())
     if os.environ.get(REMAKE) == "1":
-        print(f"made anew: {told}")
+        print(f"made anew: {outdated}")
         return
     raise PipelineError(
-        f"finished work would be made anew: {told}",
+        f"finished work would be made anew: {outdated}",
         where=where,
         expected="the recipes, packages, machine code and OpenGL device that it was made with",
         remedy=f"go on with the version and the machine that made it, or allow it: {allow}",
@@ -161,5 +161,7 @@ def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
 def _parts(step: Step) -> tuple[dict[str, int], dict[str, str], str]:
     origins.check()
     steps = (*AFTER.get(step, ()), step)
-    packages = {name: version(name) for each in steps for name in PACKAGES.get(each, ())}
+    packages: dict[str, str] = {}
+    for each in steps:
+        packages.update({name: version(name) for name in PACKAGES.get(each, ())})
     return {each: RECIPES[each] for each in steps}, packages, fixed_machine_code()

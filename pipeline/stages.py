@@ -1,7 +1,7 @@
 """The stages of a run in order: from demonstrations to datasets, checks and reports.
 
-Each stage is a function of a ``Run``. ``perform`` calls one, unless its inputs and outputs are as they were after the
-last call. The command ``run`` performs all stages in one process; the scripts in ``stages/`` perform one, for DVC.
+Each stage is a function of a ``Run``. ``perform`` calls it, unless its inputs and outputs are unchanged since the last
+call. The command ``run`` performs all stages in one process; each script in ``stages/`` performs one stage, for DVC.
 """
 
 import argparse
@@ -59,7 +59,8 @@ class Stage:
     """A step of a run.
 
     Attributes:
-        work: does it. A stage without inputs runs every time, and finds out by itself whether something is to do.
+        work: function that performs the stage. A stage without inputs runs every time and decides itself if work is
+            left.
         settings: sections of ``settings.json`` that its outputs depend on.
         inputs: files and folders of the run that it reads.
         outputs: files and folders of the run that it writes.
@@ -89,13 +90,13 @@ def _lost(run: Run) -> list[str]:
 
 
 def doctor(run: Run) -> None:
-    """Check the machine and the installation against what the run needs, and record what it begins with."""
+    """Check the machine and the installation against the needs of the run, and record the machine's trial."""
     from pipeline.validation import doctor
 
     try:
         tried = finished.of_doctor(run, gl.choose().device).holds()
     except (PipelineError, PackageNotFoundError):
-        # The table names what is missing.
+        # The table of `doctor.run` reports missing packages.
         tried = False
     if doctor.run(run, tried=tried):
         raise PipelineError(
@@ -146,7 +147,7 @@ def replay(run: Run) -> None:
     with run.workers() as workers:
         replays = Replays(config.demos, config.replay, run.trajectories.root, workers, config.filter)
         verdicts = replays.of(rows)
-    # Also the reserves that the stage render replayed because frames were rejected.
+    # Keep the reserves too that the stage `render` replayed because frames were rejected.
     run.trajectories.keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
     write_json(run.path(REPLAY), {"replayed": len(verdicts), "kept": kept})
@@ -216,10 +217,10 @@ def write_manifest(run: Run) -> None:
 
 
 def validate(run: Run) -> None:
-    """Reopen the datasets and the manifest, and stop where they differ from what was made."""
+    """Reopen the datasets and the manifest, and stop if they differ from the generated episodes."""
     file = run.validation_file
     if finished.of_validate(run).holds():
-        # `push` asks for checks that are no older than what they are about.
+        # `push` requires checks that are no older than the checked files.
         file.touch()
         print(f"nothing has changed since the checks of {file} found nothing off")
         return
@@ -243,7 +244,7 @@ def validate(run: Run) -> None:
 
 
 def write_recipe(run: Run) -> None:
-    """Write the fine-tuning recipe, and what each policy's code needs to train on the datasets as they are."""
+    """Write the fine-tuning recipe, and the files that each policy's code needs to train on the datasets."""
     from pipeline.clients import recipe
 
     export = run.config.export
@@ -254,7 +255,7 @@ def write_recipe(run: Run) -> None:
 
 
 def summarize(run: Run) -> None:
-    """Render contact sheets, of the run and of one task per suite, and print what the run made."""
+    """Render contact sheets, of the run and of one task per suite, and print the run's counts."""
     rows, episodes = run.manifest, run.config.plan.episodes
     memory = finished.of_summary(run)
     if not memory.holds():
@@ -348,7 +349,7 @@ def run_all(file: Path) -> Run:
 
 
 def perform(name: str, run: Run) -> None:
-    """Perform a stage, unless its inputs and outputs are as they were after the last call.
+    """Perform a stage, unless its inputs and outputs are unchanged since the last call.
 
     Raises:
         PipelineError: when the stage stops.
@@ -366,7 +367,7 @@ def perform(name: str, run: Run) -> None:
 
 
 def _memory(name: str, run: Run) -> Memory | None:
-    """Return what the stage remembers of its last call, `None` for a stage that runs every time."""
+    """Return the memory of the stage's last call, `None` for a stage that runs every time."""
     stage = STAGES[name]
     if not stage.outputs:
         return None

@@ -1,7 +1,7 @@
-"""The Parquet tables of a run, with checksums: made when they are written, checked when they are read.
+"""Parquet tables of a run, with checksums that are written with the table and checked when it is read.
 
-Parquet has one for each page of values. It has none for the footer, which says where columns lie and how they are
-encoded, so there is one of the values too.
+Parquet has a checksum for each page of values, but none for the footer, which states the places and encodings of the
+columns. These tables therefore also have a checksum of all values.
 """
 
 import json
@@ -18,24 +18,25 @@ from pipeline.errors import PipelineError
 from pipeline.files import replaced
 
 SEAL = b"sha256"
-"""The table's metadata that has the checksum of its values."""
+"""Key of the table's metadata for the checksum of its values."""
 
 
 _TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
 def column(name: str, values: pa.DataType, meaning: str) -> pa.Field:
-    """A column, and what is in it."""
+    """Return a column with its meaning as metadata."""
     return pa.field(name, values, metadata={"meaning": meaning})
 
 
 def columns_of(record: type[Any]) -> list[pa.Field]:
-    """A column for each field of a dataclass of ``Annotated[type, meaning]``; the type may be optional."""
+    """Return a column for each field of a dataclass of ``Annotated[type, meaning]``; the type may be optional."""
     hints = get_type_hints(record, include_extras=True)
     columns = []
     for each in fields(record):
         declared, meaning = get_args(hints[each.name])
-        kind = next(one for one in get_args(declared) or (declared,) if one is not type(None))
+        alternatives = get_args(declared) or (declared,)
+        kind = next(alternative for alternative in alternatives if alternative is not type(None))
         columns.append(column(each.name, _TYPES[kind], meaning))
     return columns
 
@@ -47,15 +48,18 @@ def write_table(table: pa.Table, path: Path) -> None:
 
 
 def read_table(path: Path, columns: Collection[str], remedy: str) -> pa.Table:
-    """A table as it was written, with these columns at least; ``remedy`` tells how it is made again.
+    """Read a table, and check that it is as written and has at least these columns.
+
+    Args:
+        remedy: command that generates the table again, for errors.
 
     Raises:
-        PipelineError: when it is missing or damaged, or lacks columns.
+        PipelineError: when the table is missing or damaged, or lacks columns.
     """
     if not path.is_file():
         raise PipelineError("not there", where=path, remedy=remedy)
     try:
-        # Without threads: of several faults, always the same is told. Unlike pq.read_table, it imports no pandas.
+        # Without threads, the same one of several errors is always reported. pq.read_table would import pandas.
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read(use_threads=False)
         if (table.schema.metadata or {}).get(SEAL) != _digest(table):
@@ -64,7 +68,8 @@ def read_table(path: Path, columns: Collection[str], remedy: str) -> pa.Table:
         raise
     except (OSError, ValueError, TypeError, LookupError, RuntimeError, pa.ArrowException) as error:
         raise PipelineError(f"damaged ({error})", where=path, remedy=f"move it away, and {remedy}") from error
-    if lacking := sorted(set(columns) - set(table.column_names)):
+    lacking = sorted(set(columns) - set(table.column_names))
+    if lacking:
         raise PipelineError(
             f"lacks the columns {', '.join(lacking)}", where=path, expected="a file of this version", remedy=remedy
         )

@@ -1,4 +1,4 @@
-"""How a command is added, and how a run is named: by its configuration, or else the one that ``params.yaml`` names."""
+"""Registration of commands, and the choice of a run: by its configuration, or else by ``params.yaml``."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Fill = Callable[[argparse.ArgumentParser], object]
 
 
 class LazyParser(argparse.ArgumentParser):
-    """Gets its arguments when it is first asked to parse, as what they may be can take long to import.
+    """Parser that adds its arguments at the first parse, as the imports for their choices can take long.
 
-    Options may stand between arguments: argparse itself takes an argument that may be left out, as CONFIG, for left out
-    when an option comes before it.
+    Options may stand between arguments. Plain argparse treats an optional argument, such as CONFIG, as left out if an
+    option comes before it.
     """
 
     summary: str = ""
@@ -38,7 +38,7 @@ class LazyParser(argparse.ArgumentParser):
             fill(self)
         if self._subparsers or self._sorting:
             return super().parse_known_args(args, namespace)
-        self._sorting = True  # what follows calls this method again
+        self._sorting = True  # The next call calls this method again.
         try:
             return self.parse_known_intermixed_args(args, namespace)
         finally:
@@ -46,21 +46,21 @@ class LazyParser(argparse.ArgumentParser):
 
 
 def argument(*names: str, **how: Any) -> Fill:
-    """An argument of a command, as ``add_argument`` takes it."""
+    """Return a function that adds an argument to a command; the parameters are those of ``add_argument``."""
     return lambda command: command.add_argument(*names, **how)
 
 
 def value(name: str, metavar: str, told: str, kind: Callable[[str], object] = Path, **how: Any) -> Fill:
-    """An argument that has a value, by default a path; ``told`` is its help."""
+    """Return a function that adds an argument with a value, by default a path; ``told`` is its help."""
     return argument(name, metavar=metavar, help=told, type=kind, **how)
 
 
 def add(commands: Any, run: Callable[[argparse.Namespace], int | None], *fills: Fill) -> None:
-    """Add a command of a function's name, whose docstring says what it does, in its first line and in more.
+    """Add a command with the name of a function, whose docstring becomes the help text.
 
     Args:
-        run: does it; returns the exit status, or nothing for 0.
-        fills: add its arguments, once they are needed.
+        run: performs the command; returns the exit status, or `None` for 0.
+        fills: add the command's arguments once they are needed.
     """
     described, _, details = (inspect.getdoc(run) or "").partition("\n\n")
     description = f"{described[:1].upper()}{described[1:]}.\n\n{details}".strip()
@@ -71,14 +71,14 @@ def add(commands: Any, run: Callable[[argparse.Namespace], int | None], *fills: 
 
 
 def add_group(commands: Any, name: str, summary: str) -> Any:
-    """Add a command that has commands of its own; what ``add`` adds them to."""
+    """Add a command that has subcommands, and return the object that ``add`` adds them to."""
     group = commands.add_parser(name, help=summary, description=f"{summary[:1].upper()}{summary[1:]}.")
     group.summary = summary
     return group.add_subparsers(required=True, metavar="VERB")
 
 
 def positive(text: str) -> int:
-    """Type of an argument that is a number from 1 on."""
+    """Parse an argument that is a whole number of at least 1."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"{number} is less than 1")
@@ -86,7 +86,7 @@ def positive(text: str) -> int:
 
 
 def at_least_zero(text: str) -> int:
-    """Type of an argument that is a number from 0 on."""
+    """Parse an argument that is a whole number of at least 0."""
     number = int(text)
     if number < 0:
         raise argparse.ArgumentTypeError(f"{number} is less than 0")
@@ -101,9 +101,9 @@ def _positive_number(text: str) -> float:
 
 
 def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **options: str) -> None:
-    """Add an option for each of some fields of a model: with its type and its choices, and its docstring as help.
+    """Add an option for each named field of a model, with the field's type, choices and docstring.
 
-    What is left out has no attribute, so that the model's default holds.
+    An option that the user leaves out sets no attribute, so that the model's default holds.
 
     Args:
         options: field to option.
@@ -120,20 +120,21 @@ def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **optio
             kind = next(iter(get_args(kind)), kind)
             above_0 = positive if kind is int else _positive_number
             how |= {"type": above_0 if field.metadata else kind, "metavar": option.strip("-").upper()}
-        told = f" (default: {default})" if default not in (None, "", ()) else ""
-        command.add_argument(option, help=f"{field.description}{told}".replace("\n", " ").replace("``", ""), **how)
+        suffix = f" (default: {default})" if default not in (None, "", ()) else ""
+        help_text = f"{field.description}{suffix}".replace("\n", " ").replace("``", "")
+        command.add_argument(option, help=help_text, **how)
 
 
 _CONFIG = "file of the run's configuration, such as configs/starter.yaml (default: the one that params.yaml names)"
 add_config = value("config", "CONFIG", _CONFIG, nargs="?")
-"""The run that a command is about, its last argument."""
+"""Argument for the run's configuration, the last argument of a command."""
 
 
 def config_file(arguments: argparse.Namespace) -> Path:
-    """The configuration that a command was given, or the one that ``dvc repro`` would run here.
+    """Return the path of the given configuration, or of the configuration that ``dvc repro`` would run here.
 
     Raises:
-        PipelineError: when neither is there.
+        PipelineError: when no configuration is given, and ``params.yaml`` names none.
     """
     if arguments.config is not None:
         return Path(arguments.config)
@@ -150,7 +151,7 @@ def config_file(arguments: argparse.Namespace) -> Path:
 
 
 def loaded(arguments: argparse.Namespace) -> Config:
-    """Load the configuration that a command was given, whose run may be one of another file of that name.
+    """Load the configuration that a command was given, even if its run's folder belongs to another file.
 
     Raises:
         PipelineError: as ``config.load``.
@@ -172,7 +173,7 @@ def owned(arguments: argparse.Namespace) -> Run:
 
 
 def plan_of(text: str) -> Path:
-    """Type of an argument that names a configuration and stands for its run's plan."""
+    """Parse an argument that names a configuration, and return the file of its run's plan."""
     from pipeline.run import stage
 
     return stage.owned(Path(text)).plan_file

@@ -1,4 +1,4 @@
-"""Before a run: what there is, what an axis does, and whether the machine is fit."""
+"""Commands before a run: ``doctor``, ``axes``, ``tasks``, ``preview``, ``sources`` and ``rewrite``."""
 
 import argparse
 import json
@@ -10,18 +10,18 @@ from pipeline.commands.base import add, add_config, loaded, positive, value
 TITLE = "before a run"
 
 PREVIEW = "perturbed-demos: preview"
-"""Comment in a picture that `preview` wrote, and may overwrite."""
+"""Comment in the pictures of `preview`, which marks files that it may overwrite."""
 
 EVERY = "all"
-"""In place of an axis: one picture of each."""
+"""Argument in place of an axis, for one picture of each axis."""
 
 
 def add_commands(commands: Any) -> None:
     add(commands, doctor, add_config)
     add(commands, axes)
     add(commands, tasks, value("patterns", "PATTERN", "as in demos.tasks, such as 'libero_goal/*'", str, nargs="*"))
-    shown = value("--out", "FILE", "picture to write (default: sheet.png)", default=Path("sheet.png"))
-    add(commands, preview, _preview_arguments, add_config, shown)
+    out = value("--out", "FILE", "picture to write (default: sheet.png)", default=Path("sheet.png"))
+    add(commands, preview, _preview_arguments, add_config, out)
     add(commands, sources, add_config)
     add(
         commands,
@@ -92,7 +92,7 @@ def preview(arguments: argparse.Namespace) -> None:
     config = loaded(arguments)
     chosen = select_tasks([arguments.task])
     refuse_other_file(arguments.out, PREVIEW)
-    gl.choose()  # Where nothing renders, that is said before anything takes time.
+    gl.choose()  # Without a working renderer, stop before slow work.
     stage = preview.staged(chosen, config)
     with replaced(arguments.out) as temporary:
         if arguments.axis == EVERY:
@@ -102,11 +102,11 @@ def preview(arguments: argparse.Namespace) -> None:
         if arguments.out.suffix == ".jpg":
             picture.save(temporary, format="JPEG", quality=90, comment=PREVIEW)
         else:
-            described = PngInfo()
-            described.add_text("Software", PREVIEW)
-            picture.save(temporary, format="PNG", pnginfo=described)
-        of = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
-        print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")
+            metadata = PngInfo()
+            metadata.add_text("Software", PREVIEW)
+            picture.save(temporary, format="PNG", pnginfo=metadata)
+        among = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
+        print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{among}")
 
 
 def sources(arguments: argparse.Namespace) -> None:
@@ -116,9 +116,11 @@ def sources(arguments: argparse.Namespace) -> None:
     """
     from pipeline.axes import AXES
 
-    drawn = loaded(arguments).plan.axes.drawn()
-    offered = [(drawn.get(name) or axis()).offered() for name, axis in AXES.items()]
-    print(json.dumps({kind: number for of_axis in offered for kind, number in of_axis.items()}))
+    axes_of_run = loaded(arguments).plan.axes.drawn()
+    numbers: dict[str, int] = {}
+    for name, axis in AXES.items():
+        numbers.update((axes_of_run.get(name) or axis()).offered())
+    print(json.dumps(numbers))
 
 
 def rewrite(arguments: argparse.Namespace) -> None:

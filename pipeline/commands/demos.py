@@ -97,8 +97,8 @@ def check(arguments: argparse.Namespace) -> int:
 
     replay = load(arguments.config).replay if arguments.config else ReplayConfig()
     with runner(ComputeConfig(), arguments.folder) as run:
-        found = check(arguments.folder, arguments.replay, run, replay)
-    for line in (*found.notes, *found.faults):
+        report = check(arguments.folder, arguments.replay, run, replay)
+    for line in (*report.notes, *report.faults):
         print(line)
-    print(json.dumps(asdict(found)))
-    return int(bool(found.faults))
+    print(json.dumps(asdict(report)))
+    return int(bool(report.faults))

@@ -1,4 +1,4 @@
-"""For contributors."""
+"""Commands for contributors."""
 
 import argparse
 import json
@@ -16,7 +16,7 @@ def add_commands(commands: Any) -> None:
 
 
 def schemas() -> dict[str, dict[str, Any]]:
-    """The files of ``schemas/`` that are written from the code."""
+    """Return the content of the files of ``schemas/`` that follow from the code, by file name."""
     from pipeline.config import Config
     from pipeline.formats import registry
     from pipeline.run import manifest

@@ -1,4 +1,4 @@
-"""Policies: ``evaluate`` and ``analyse``. Each prints one line of JSON last."""
+"""Commands about policies: ``evaluate`` and ``analyse``. Each prints one line of JSON last."""
 
 import argparse
 import json
@@ -105,8 +105,9 @@ def evaluate(arguments: argparse.Namespace) -> None:
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
     with runner(compute, arguments.out, renders=True) as run:
-        found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
-    print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
+        selection = Selection.model_validate(given(*Selection.model_fields))
+        summary = evaluate(evaluation, selection, run, workers)
+    print(json.dumps({"all": summary["all"], "refused": summary["refused"], "by_axis": summary["by_axis"]}))
 
 
 def report(arguments: argparse.Namespace) -> None:
@@ -137,10 +138,13 @@ def coverage(arguments: argparse.Namespace) -> None:
     measures = seen.measure(owned(arguments), benchmark.load())
     table = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
     table.caption = "A run adds each number of objects equally often, unless it is configured otherwise."
-    for one in measures:
-        table.add_row(one.axis, one.what, *("-" if of is None else str(of) for of in (one.tested, one.ours)))
+    figures: dict[str, Any] = {}
+    for measure in measures:
+        cells = ["-" if spread is None else str(spread) for spread in (measure.tested, measure.ours)]
+        table.add_row(measure.axis, measure.what, *cells)
+        figures[f"{measure.axis}: {measure.what}"] = {"tests": measure.tested, "run": measure.ours}
     Console().print(table)
-    print(json.dumps({f"{one.axis}: {one.what}": {"tests": one.tested, "run": one.ours} for one in measures}))
+    print(json.dumps(figures))
 
 
 def gap(arguments: argparse.Namespace) -> None:
@@ -185,12 +189,16 @@ def grade(arguments: argparse.Namespace) -> None:
 
     refuse_other_list(arguments.out)
     results = [stored([folder]) for folder in arguments.results]
-    seed, *others = sorted({row.seed for of_model in results for row, _ in of_model})
-    if others:
-        raise PipelineError(f"results of seeds {[seed, *others]}", expected="one seed, and so the same draws")
+    seeds: set[int] = set()
+    for results_of_model in results:
+        seeds.update(row.seed for row, _ in results_of_model)
+    seed, *further_seeds = sorted(seeds)
+    if further_seeds:
+        raise PipelineError(f"results of seeds {sorted(seeds)}", expected="one seed, and so the same draws")
     graded = grade(results)
     write_tasks(graded, seed, arguments.out)
-    by_level = {level: sum(task["difficulty"] == level for task in graded) for level in range(1, 6)}
+    difficulties = [task["difficulty"] for task in graded]
+    by_level = {level: difficulties.count(level) for level in range(1, 6)}
     print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
 
 
@@ -201,15 +209,15 @@ def leakage(arguments: argparse.Namespace) -> int:
     from pipeline.evaluation.results import stored
     from pipeline.libero.tasks import find_task
 
-    drawn = [
-        (row.name, one, find_task(row.suite, row.base))
-        for row, _ in stored([arguments.results])
-        if row.source == "own"
-        for one in from_json(json.dumps(row.perturbations))
-    ]
-    if not drawn:
+    perturbations = []
+    for row, _ in stored([arguments.results]):
+        if row.source != "own":
+            continue
+        for perturbation in from_json(json.dumps(row.perturbations)):
+            perturbations.append((row.name, perturbation, find_task(row.suite, row.base)))
+    if not perturbations:
         lacking = "there are no held-out perturbations"
         raise PipelineError(lacking, where=arguments.results, remedy="evaluate --source own")
-    findings = own_draws.compare(drawn, own_draws.planned(owned(arguments).plan_file))
+    findings = own_draws.compare(perturbations, own_draws.planned(owned(arguments).plan_file))
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

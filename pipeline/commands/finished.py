@@ -1,4 +1,4 @@
-"""A finished run, or a dataset from elsewhere: ``check``, ``audit``, ``regenerate`` and ``push``."""
+"""Commands about a finished run or a third-party dataset: ``check``, ``audit``, ``regenerate`` and ``push``."""
 
 import argparse
 import json
@@ -53,14 +53,18 @@ def check(arguments: argparse.Namespace) -> int:
     run = owned(arguments)
     with run.workers() as workers:
         stored = verify(run, workers)
-    damaged = [what for found in stored.values() for what in found["damaged"]]
+    damaged: list[str] = []
+    for findings in stored.values():
+        damaged += findings["damaged"]
     trained: dict[str, Any] = {}
-    # OpenVLA-OFT's reader stops at what is damaged.
+    # OpenVLA-OFT's reader stops at damaged files.
     if run.config.export.rlds and not stored["rlds"]["damaged"]:
         trained = oft.check_all(run.dataset("rlds").folder, run.path(STATISTICS))
-    misleading = [f"{name}: {what}" for name, found in trained.items() for what in found["violations"]]
-    for what in (*damaged, *misleading):
-        print(what)
+    misleading: list[str] = []
+    for name, findings in trained.items():
+        misleading += [f"{name}: {violation}" for violation in findings["violations"]]
+    for line in (*damaged, *misleading):
+        print(line)
     print(json.dumps({**stored, "openvla_oft": trained}))
     return int(bool(damaged or misleading))
 
@@ -80,12 +84,12 @@ def audit(arguments: argparse.Namespace) -> int:
     from pipeline.testset import benchmark
     from pipeline.validation.audit import audit
 
-    found = audit(arguments.dataset, benchmark.load(), arguments.manifest)
-    rich.print(leakage.report(found.axes))
-    for axis, episodes in found.unknown.items():
-        print(f"{axis}: not known of {episodes:,} of {found.episodes:,} episodes: no labels, no text, or no known task")
-    print(json.dumps(asdict(found) | {"unknown": found.unknown}))
-    return int(any(finding.overlaps for finding in found.axes.values()))
+    result = audit(arguments.dataset, benchmark.load(), arguments.manifest)
+    rich.print(leakage.report(result.axes))
+    for axis, number in result.unknown.items():
+        print(f"{axis}: not known of {number:,} of {result.episodes:,} episodes: no labels, no text, or no known task")
+    print(json.dumps(asdict(result) | {"unknown": result.unknown}))
+    return int(any(finding.overlaps for finding in result.axes.values()))
 
 
 def regenerate(arguments: argparse.Namespace) -> int:
@@ -105,11 +109,11 @@ def regenerate(arguments: argparse.Namespace) -> int:
     if manifest is None:
         run = owned(arguments)
         manifest, demos = run.manifest_file, run.config.demos.root
-    found = regenerate(arguments.episode_id, manifest, arguments.out, demos)
-    if found["identical"] is None:
+    result = regenerate(arguments.episode_id, manifest, arguments.out, demos)
+    if result["identical"] is None:
         print(f"only made, in {arguments.out}: no RLDS set lies beside {manifest} to compare it with", file=sys.stderr)
-    print(json.dumps(found))
-    return int(found["identical"] is False or found["reason"] != "kept")
+    print(json.dumps(result))
+    return int(result["identical"] is False or result["reason"] != "kept")
 
 
 def _format(command: argparse.ArgumentParser) -> None:

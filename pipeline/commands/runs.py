@@ -1,4 +1,4 @@
-"""Making datasets: ``run``, ``status`` and ``clean``."""
+"""Commands that make datasets: ``run``, ``status`` and ``clean``."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def results(run: Run) -> dict[str, Path]:
-    """Return what a person opens of a finished run, by name."""
+    """Map names to the files and folders of a finished run that a person opens."""
     from pipeline.run.run import CARD, FINETUNE, PREVIEWS, SHEETS
 
     return {
@@ -95,21 +95,24 @@ def clean(arguments: argparse.Namespace) -> None:
 
     run = owned(arguments)
     stage.refuse_unmarked(run.folder)
-    found = cleaning.found(run, arguments.only or tuple(cleaning.PARTS))
-    if not found:
+    size_of_part = cleaning.found(run, arguments.only or tuple(cleaning.PARTS))
+    if not size_of_part:
         print(f"{run.folder} has nothing of this")
         return
-    for part, size_mb in found.items():
+    for part, size_mb in size_of_part.items():
         print(f"{size_mb:10.1f} MB  {part:<13} made again by {cleaning.PARTS[part].made_by}")
-    print(f"{sum(found.values()):10.1f} MB  in all, of {run.folder}")
-    for edit in edits_in_words(run.folder) if "uploads" in found else ():
+    print(f"{sum(size_of_part.values()):10.1f} MB  in all, of {run.folder}")
+    for edit in edits_in_words(run.folder) if "uploads" in size_of_part else ():
         print(edit)
-    foreign.refuse_foreign_files(run.folder, [name for part in found for name in cleaning.PARTS[part].names])
+    names: list[str] = []
+    for part in size_of_part:
+        names += cleaning.PARTS[part].names
+    foreign.refuse_foreign_files(run.folder, names)
     if not arguments.yes:
         if not sys.stdin.isatty():
             raise PipelineError("nothing was deleted, as nobody can be asked here", remedy="add --yes")
         if input("Delete all of this? [y/N] ").strip().lower() not in ("y", "yes"):
             print("nothing was deleted")
             return
-    cleaning.delete(run, list(found))
+    cleaning.delete(run, list(size_of_part))
     print("deleted")

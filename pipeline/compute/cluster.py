@@ -1,7 +1,7 @@
-"""What the workers of a cluster elsewhere must have in common with the run, checked before they do anything.
+"""Checks that the workers of an external cluster share folders, packages and code with the run before they work.
 
-A worker may have been started in another folder, on another machine, with other packages or before the code was last
-edited, and it may have served other runs. None of this may change a result or write where nobody looks.
+A worker may have been started in another folder, on another machine, with other packages or before the last edit of the
+code. It may also have served other runs. None of this may change a result or write files to a wrong folder.
 """
 
 import platform
@@ -33,12 +33,12 @@ SOURCES = (".py", ".yaml", ".json", ".j2")
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where a run works, and with what.
+    """Folders and setup of a run, which its workers must share.
 
     Attributes:
         folder: absolute path of the folder that the run was started in, from which its relative paths start.
         token: absolute path of a file that the run wrote for its workers to find.
-        setup: what ``setup()`` is there.
+        setup: result of ``setup()`` in the run's process.
     """
 
     folder: Path
@@ -46,41 +46,47 @@ class Workplace:
     setup: Mapping[str, str]
 
     def enter(self) -> None:
-        """Make sure that this process may work for the run, and forget what it knows of earlier ones.
+        """Check that this process may work for the run, and forget the state of earlier runs.
 
         Raises:
-            PipelineError: when the run's folder is not here, or other code or packages are.
+            PipelineError: when the process does not see the run's folder, or has other code or packages.
         """
         global _entered
         if _entered == self:
             return
         from distributed import get_worker
 
-        if faults := self.faults(get_worker()):
+        faults = self.faults(get_worker())
+        if faults:
             raise _refusal(f"worker on {platform.node()}", faults)
         _forget()
         _entered = self
 
     def faults(self, dask_worker: Any) -> list[str]:
-        """In a worker, which Dask fills in by the argument's name: why it cannot work for the run."""
-        found = []
+        """List the reasons why this worker cannot work for the run; Dask calls it in the worker.
+
+        Args:
+            dask_worker: filled in by Dask, by the argument's name.
+        """
+        reasons = []
         if not (self.token.is_file() and self.folder.is_dir()):
-            found.append(f"does not see {self.token.parent}, or another folder lies at that path there")
+            reasons.append(f"does not see {self.token.parent}, or another folder lies at that path there")
         here = setup()
         for name, version_of_run in self.setup.items():
             if here.get(name) != version_of_run:
-                found.append(f"has {name} {here.get(name, 'not installed')}, the run has {version_of_run}")
-        if (threads := dask_worker.state.nthreads) != 1:
-            found.append(f"runs {threads} threads, and the simulator needs a process for itself")
-        return found
+                reasons.append(f"has {name} {here.get(name, 'not installed')}, the run has {version_of_run}")
+        threads = dask_worker.state.nthreads
+        if threads != 1:
+            reasons.append(f"runs {threads} threads, and the simulator needs a process for itself")
+        return reasons
 
 
 _entered: Workplace | None = None
-"""The run that this process worked for last."""
+"""Workplace of the run that this process worked for last."""
 
 
 def in_place(fn: Callable[[Item], Result], workplace: Workplace, item: Item) -> Result:
-    """Call a function in a worker as it would be where the run was started."""
+    """Call a function in a worker, in the folder that the run was started in."""
     workplace.enter()
     with chdir(workplace.folder):
         return fn(item)
@@ -88,11 +94,12 @@ def in_place(fn: Callable[[Item], Result], workplace: Workplace, item: Item) -> 
 
 @cache
 def setup() -> dict[str, str]:
-    """What a result may depend on beside its input: versions of Python and the packages, code and machine code.
+    """Return everything except the input that a result may depend on.
 
-    A process keeps the code that it imported first, so this is found out once and not again.
+    These are the versions of Python and the packages, the code and the machine code. The result is cached, as a process
+    keeps the code that it imported first.
     """
-    # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
+    # A Dask worker imports NumPy before this project, so its environment decides NumPy's machine code.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
         required = [Requirement(line).name for line in requires(DISTRIBUTION) or []]
@@ -109,31 +116,36 @@ def setup() -> dict[str, str]:
 
 @contextmanager
 def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
-    """Check every worker that a Dask client has now; later ones are checked when they get their first work.
+    """Check every worker that a Dask client has now; later workers are checked when they get their first work.
 
-    The run writes into ``folder``.
+    Args:
+        folder: the run writes into it.
 
     Raises:
-        PipelineError: naming every worker that cannot work for this run, and why.
+        PipelineError: naming every worker that cannot work for this run, and the reason.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    # Of a killed run, the next stage deletes it as it does all such files (``files.remove_leftovers``).
+    # If the run is killed, the next stage deletes the token with all temporary files (``files.remove_leftovers``).
     token = folder.absolute() / f".cluster.{uuid4().hex}.tmp"
     workplace = Workplace(Path.cwd(), token, setup())
     token.touch()
     try:
         reports = client.run(workplace.faults, on_error="return")
         addresses: dict[str, list[str]] = {}
-        for address, found in reports.items():
-            if isinstance(found, BaseException):
-                found = [f"cannot execute this run's code ({type(found).__name__}: {found})"]
-            for fault in found:
+        for address, report in reports.items():
+            faults_of_worker = report
+            if isinstance(report, BaseException):
+                faults_of_worker = [f"cannot execute this run's code ({type(report).__name__}: {report})"]
+            for fault in faults_of_worker:
                 addresses.setdefault(fault, []).append(address)
         if addresses:
-            refused = {address for of_fault in addresses.values() for address in of_fault}
-            # Three addresses of each fault are enough to find the machines by.
-            faults = [f"{', '.join(named[:3])} {fault}" for fault, named in addresses.items()]
-            raise _refusal(f"{len(refused)} of {len(reports)} workers", faults)
+            rejected: set[str] = set()
+            faults = []
+            for fault, addresses_of_fault in addresses.items():
+                rejected.update(addresses_of_fault)
+                # Three addresses of each fault are enough to find the machines.
+                faults.append(f"{', '.join(addresses_of_fault[:3])} {fault}")
+            raise _refusal(f"{len(rejected)} of {len(reports)} workers", faults)
         yield workplace
     finally:
         token.unlink(missing_ok=True)
@@ -150,12 +162,13 @@ def _refusal(where: str, faults: list[str]) -> PipelineError:
 
 
 def _forget() -> None:
-    """Empty every cache of this package: what lies at a path, such as a bank of rewrites, may be another file now."""
-    if (open_scenes := sys.modules.get(f"{PACKAGE}.rendering.renderer")) is not None:
-        open_scenes.scene_of_process().close()
+    """Empty every cache of this package, as files at the same paths, such as a bank of rewrites, may have changed."""
+    renderer = sys.modules.get(f"{PACKAGE}.rendering.renderer")
+    if renderer is not None:
+        renderer.scene_of_process().close()
     for name, module in list(sys.modules.items()):
         if name.startswith(f"{PACKAGE}.") and name != __name__:
             for value in list(vars(module).values()):
-                # Of its type: what looks things up when they are asked for, such as OpenGL, is not to be asked.
+                # Ask the type: objects that look up attributes on access, such as OpenGL, must not be accessed.
                 if hasattr(type(value), "cache_clear"):
                     value.cache_clear()

@@ -1,4 +1,4 @@
-"""One function behind which the work is spread: worker processes here or on a cluster, or a plain loop."""
+"""Function that spreads work over worker processes on this machine or a cluster, or runs it in a plain loop."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 CONNECT_S = 30
-"""How long to wait for a scheduler's answer."""
+"""Time to wait for a scheduler's answer."""
 
 ALONE_S = 30
-"""How long to wait for a worker where none is left."""
+"""Time to wait for a worker if none is left."""
 
 LOOK_S = 5
-"""How often to look whether there are workers, while nothing gets done."""
+"""Time between two looks for workers, while no work ends."""
 
 LOST = "worker_lost"
-"""Why an item was dropped that no worker survives, or that none finishes."""
+"""Reason of an item that was dropped because no worker survives or finishes it."""
 
 TRIES = 2
-"""After so many workers that ended over it, a piece of work is taken for their cause, and then tried as often alone."""
+"""Number of workers that end over an item before the item counts as the cause and is tried as often alone."""
 
 
 @dataclass(frozen=True)
 class Expendable(Generic[Item, Result]):
-    """A function of which one item may be given up, where no worker survives it or finishes it.
+    """A function whose items may be given up if no worker survives or finishes them.
 
     Attributes:
         fn: the function.
-        limit_s: so long an item may take; then it hangs, and its worker is ended. Far above what any takes.
-        lost: called in the run's own process; what it returns takes the place of the item's result.
-        size: how much of the work an item is, where items are not alike; progress is counted in it.
+        limit_s: time after which an item counts as hanging, and its worker is ended; far above the time of any item.
+        lost: called in the run's own process for an item that was given up; its result replaces the item's result.
+        size: amount of work of an item, in the unit of the progress bar.
     """
 
     fn: Callable[[Item], Result]
@@ -61,17 +61,17 @@ class Expendable(Generic[Item, Result]):
 
 
 class Workers(Protocol):
-    """Apply ``fn`` to every item, in any order and place; the results come back in the order of the items.
+    """Function that applies ``fn`` to every item, in any order and place, and returns results in the items' order.
 
-    A worker that dies is replaced, and its item is done again. An item over which workers die again and again ends the
-    run, unless ``fn`` is ``Expendable``.
+    A worker that dies is replaced, and its item is repeated. An item over which workers die repeatedly ends the run,
+    unless ``fn`` is ``Expendable``.
     """
 
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]: ...
 
 
 def loop(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
-    """Everything in this process, one after the other: for debugging and small jobs. What ends it ends the run."""
+    """Run all items in this process, one after the other: for debugging and small jobs. A crash ends the run."""
     sizes = _sizes(fn, items)
     with progress_of(description, sum(sizes)) as advance:
         results = []
@@ -87,13 +87,13 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 
 @contextmanager
 def runner(config: ComputeConfig, folder: Path, renders: bool = False) -> Iterator[Workers]:
-    """Yield the function that runs work on what ``config.cluster`` names. Nothing is started before there is work.
+    """Yield the function that runs work on the workers that ``config.cluster`` names; they start with the first work.
 
-    With the first work comes a ``PipelineError`` when no scheduler answers, or a worker cannot work for this run.
+    The first work raises a ``PipelineError`` if no scheduler answers, or a worker cannot work for this run.
 
     Args:
-        folder: what the work writes into; the workers of a cluster elsewhere must see it too.
-        renders: whether the work does: local workers then render with what this process has chosen.
+        folder: folder that the work writes into; the workers of an external cluster must see it too.
+        renders: True if the work renders. Local workers then render with the device that this process has chosen.
     """
     if config.cluster == "loop":
         yield loop
@@ -111,13 +111,13 @@ def runner(config: ComputeConfig, folder: Path, renders: bool = False) -> Iterat
 
 @contextmanager
 def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Workers]:
-    # One thread a worker process: GL contexts and the simulator are not shared, and OpenCV and NumPy would otherwise
-    # each start a thread for every core in every worker. The environment is inherited by spawned workers.
+    # Each worker process has one thread, as GL contexts and the simulator are not shared. Without these variables,
+    # OpenCV and NumPy would each start a thread for every core in every worker. Spawned workers inherit them.
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     import dask
     from distributed import Client
 
-    # What the scheduler of a cluster elsewhere does, its own settings say.
+    # The scheduler of an external cluster has its own settings.
     dask.config.set(
         {
             "distributed.worker.multiprocessing-method": "spawn",
@@ -153,7 +153,7 @@ def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Wo
 
 
 def _limited(fn: Expendable[Item, Result], item: Item) -> Result:
-    """In a worker, whose process is ended when an item takes too long, also where it hangs in a library."""
+    """Call ``fn`` in a worker, and end the worker's process if the item takes too long, even within a library."""
     faulthandler.dump_traceback_later(fn.limit_s(item), exit=True)
     try:
         return fn(item)
@@ -166,10 +166,10 @@ class _Workers:
     """Work on a client's workers.
 
     Attributes:
-        client: of the cluster.
-        workplace: what workers elsewhere have to have in common with the run.
-        refill: brings back workers that are missing.
-        patience_s: how long to wait for a worker where none is left.
+        client: Dask client of the cluster.
+        workplace: folders and setup that external workers must share with the run.
+        refill: replaces missing workers.
+        patience_s: time to wait for a worker if none is left.
     """
 
     client: Any
@@ -193,7 +193,7 @@ class _Workers:
                 results[number] = _result(outcome)
                 advance(sizes[number])
             for number in deadly:
-                # Alone now: another item may have ended the workers that this one waited on.
+                # Try it alone: another item may have ended the workers that had this item too.
                 ((_, outcome),) = self._ended(work, [items[number]])
                 if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
                     results[number] = fn.lost(items[number])
@@ -205,7 +205,7 @@ class _Workers:
     def _ended(
         self, work: Callable[[Item], Result], items: Sequence[Item]
     ) -> Generator[tuple[int, Result | Exception]]:
-        """The number of each item and its result or error, as they end."""
+        """Yield the number of each item and its result or error, in the order in which items end."""
         from distributed import CancelledError, Future, KilledWorker
 
         # Not pure: equal items are still separate work, and the scheduler must not remember earlier runs.
@@ -223,7 +223,7 @@ class _Workers:
                 try:
                     result = future.result(timeout=ALONE_S)
                 except TimeoutError:
-                    # The worker that held it died, over another item, and so it is made again.
+                    # The worker that held the result died over another item, so Dask computes the result again.
                     future.add_done_callback(done.put)
                     continue
                 except KilledWorker as error:
@@ -237,10 +237,10 @@ class _Workers:
                 self.client.cancel([future for future in futures if future.key in numbers])
 
     def _next(self, done: Queue[Any]) -> Any:
-        """The next future that is done.
+        """Return the next future that is done.
 
         Raises:
-            PipelineError: when nobody is left who could do one.
+            PipelineError: when no worker is left.
         """
         alone_s, last_came_s = 0, 0.0
         while True:
@@ -249,14 +249,14 @@ class _Workers:
             except Empty:
                 self.refill()
                 workers, came_s = self._there()
-                # A new worker may be on its way, or have come and died over its work.
+                # A new worker may be starting, or may have come and died over its work.
                 alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
                 last_came_s = came_s
                 if alone_s >= self.patience_s:
                     raise self._lost(f"no worker is left, and none came in {self.patience_s} s") from None
 
     def _there(self) -> tuple[int, float]:
-        """How many there are, and when the last of all came, by the scheduler's clock."""
+        """Return the number of workers, and the time when the last one came, by the scheduler's clock."""
         try:
             events = self.client.get_events("all")
             came_s = [stamp for stamp, event in events if event.get("action") == "add-worker"]
@@ -269,7 +269,7 @@ class _Workers:
 
 
 def _result(outcome: Result | Exception) -> Result:
-    """A result, or else the error raised, in words where workers died over an item."""
+    """Return a result, or raise the error; if workers died over the item, raise an error that says so."""
     from distributed import KilledWorker
 
     if isinstance(outcome, KilledWorker):

@@ -1,38 +1,39 @@
-"""How far the work is, in a terminal and in a log."""
+"""Progress of the work, in a terminal and in a log."""
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 SAID_EVERY_S = 60.0
-"""A log gets a line at least as often, where something gets done."""
+"""Longest time between two lines in a log, while items end."""
 
 
 @contextmanager
 def progress_of(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar with rate and ETA on a terminal; where there is none, a line every tenth of the way, and every minute."""
-    # Every process of a run imports this module, and few show how far they are.
+    """Show a bar with rate and ETA on a terminal; in a log, print a line every tenth of the work and every minute."""
+    # Every process of a run imports this module, but few show progress.
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    shown = (MofNCompleteColumn(), "{task.fields[rate]}", "elapsed", TimeElapsedColumn(), "left", TimeRemainingColumn())
-    progress = Progress("{task.description}", BarColumn(), *shown, console=console, disable=not console.is_terminal)
-    said_s = time.monotonic()
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}")
+    times = ("elapsed", TimeElapsedColumn(), "left", TimeRemainingColumn())
+    progress = Progress(*columns, *times, console=console, disable=not console.is_terminal)
+    printed_s = time.monotonic()
     with progress:
         task = progress.add_task(description, total=total, rate="")
 
         def advance(size: int) -> None:
-            nonlocal said_s
+            nonlocal printed_s
             state = progress.tasks[task]
             tenths = int(10 * state.completed / total)
             progress.advance(task, size)
             done = int(state.completed)
             rate = done / max(state.elapsed or 0.0, 1e-9)
             progress.update(task, rate=f"{rate:.2f}/s")
-            due = int(10 * done / total) > tenths or time.monotonic() - said_s >= SAID_EVERY_S
+            due = int(10 * done / total) > tenths or time.monotonic() - printed_s >= SAID_EVERY_S
             if not console.is_terminal and due:
-                said_s = time.monotonic()
+                printed_s = time.monotonic()
                 left = (total - done) / rate
                 console.print(f"{description}: {done}/{total}, {rate:.2f}/s, {left:.0f} s left", highlight=False)
 

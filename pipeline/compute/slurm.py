@@ -38,7 +38,7 @@ class SlurmJobs:
         workers: number of workers that are wanted.
         logs: folder of the jobs' output.
         started: ids of the jobs whose worker has connected to the scheduler.
-        in_vain: number of jobs that ended before their worker started, since a worker last started.
+        in_vain: number of jobs that ended before their worker started, since the last start of a worker.
     """
 
     cluster: Any
@@ -111,12 +111,12 @@ class SlurmJobs:
 def slurm_jobs(config: ComputeConfig, folder: Path) -> Iterator[SlurmJobs]:
     """Start a scheduler in this process and submit a job for each worker; cancel the jobs when the block ends.
 
-    The site's settings in ``jobqueue.yaml`` apply. Lists of both come one after the other, ours last, so that ours
-    decide where both name the same option.
+    The site's settings in ``jobqueue.yaml`` apply. Our lists are appended to the site's lists, so that ours decide if
+    both name the same option.
 
     Args:
-        config: with ``cluster: slurm``.
-        folder: what the work writes into; the nodes must see it too.
+        config: section with ``cluster: slurm``.
+        folder: folder that the work writes into; the nodes must see it too.
 
     Raises:
         PipelineError: if SLURM rejects the job.
@@ -155,7 +155,8 @@ def _of_site(name: str, former_name: str) -> list[str]:
     import dask
 
     for each in (name, former_name):
-        if values := dask.config.get(f"jobqueue.slurm.{each}", None):
+        values = dask.config.get(f"jobqueue.slurm.{each}", None)
+        if values:
             return [str(value) for value in values]
     return []
 
@@ -167,20 +168,22 @@ def _scheduler_of_site() -> dict[str, Any]:
 
 
 def _queued() -> set[str] | None:
-    """List the ids of the user's jobs that wait or run; None if SLURM does not answer."""
-    asked = subprocess.run(["squeue", "--me", "--noheader", "--format=%i"], capture_output=True, text=True, check=False)
-    return set(asked.stdout.split()) if asked.returncode == 0 else None
+    """List the ids of the user's jobs that wait or run; `None` if SLURM does not answer."""
+    answer = subprocess.run(
+        ["squeue", "--me", "--noheader", "--format=%i"], capture_output=True, text=True, check=False
+    )
+    return set(answer.stdout.split()) if answer.returncode == 0 else None
 
 
 def _try(script: str) -> None:
-    """Have SLURM check a job without submitting it.
+    """Ask SLURM to check a job without submitting it.
 
     Raises:
         PipelineError: if SLURM rejects it, in SLURM's words.
     """
     try:
-        looked = subprocess.run(["sbatch", "--test-only"], input=script, capture_output=True, text=True, check=False)
-        refusal = looked.stderr.strip() if looked.returncode else ""
+        answer = subprocess.run(["sbatch", "--test-only"], input=script, capture_output=True, text=True, check=False)
+        refusal = answer.stderr.strip() if answer.returncode else ""
     except FileNotFoundError as error:
         refusal = str(error)
     if refusal:

@@ -1,4 +1,4 @@
-"""Starts workers: processes of this machine."""
+"""Start of workers as processes of this machine."""
 
 import logging
 import os
@@ -13,14 +13,16 @@ from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
 
 STARTS = 2
-"""How often workers are started, where they end before all have started."""
+"""Number of attempts to start the workers, if they end before all have started."""
 
 
 @contextmanager
 def local_cluster(workers: int | None, renders: bool) -> Iterator[tuple[Any, Callable[[], None]]]:
-    """A client of so many workers, one for each core when left out, and what brings back those that died.
+    """Yield a client of workers on this machine, and a function that replaces workers that died.
 
-    ``renders`` is that of ``runner``.
+    Args:
+        workers: number of workers; one for each core if `None`.
+        renders: True if the work renders, see ``runner``.
 
     Raises:
         PipelineError: when the workers end while they start.
@@ -29,22 +31,25 @@ def local_cluster(workers: int | None, renders: bool) -> Iterator[tuple[Any, Cal
     from distributed import Client
 
     workers = workers or CPU_COUNT
-    # So would software GL; where workers are fewer than cores, it uses the others.
+    # Software GL would also start a thread for every core; with fewer workers than cores, it uses the remaining cores.
     os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
     with _ended(_started(workers)) as cluster, Client(cluster) as client:
         client.run(_leave_interrupts_to_the_run)
         if renders:
             _have_rendered_alike(client)
-        # A worker that dies while it starts is not replaced by Dask alone.
+        # Dask does not replace a worker that dies while it starts.
         yield client, partial(cluster.scale, workers)
 
 
 def _started(workers: int) -> Any:
-    """Worker processes on this machine. Where one of them dies before all have started, Dask ends them; they are
-    started once more."""
+    """Start worker processes on this machine.
+
+    If a process dies before all have started, Dask ends all of them; they are then started again, ``STARTS`` times in
+    all.
+    """
     from distributed import LocalCluster
 
-    # An error reaches the user once, from here.
+    # Errors are reported once, by the exception below.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     for _ in range(STARTS):
         try:
@@ -52,7 +57,7 @@ def _started(workers: int) -> Any:
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
-                # No dashboard; Dask's health page stays on this machine, on a port that is free.
+                # The dashboard is off; Dask's health page stays on this machine, on a free port.
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
                 memory_limit=None,
@@ -64,7 +69,7 @@ def _started(workers: int) -> Any:
 
 
 def ended(what: str, where: str | None = None) -> PipelineError:
-    """The error that workers ended, and nothing says why."""
+    """Return the error for workers that ended for an unknown reason."""
     expected = "workers that live: the system may have ended them because memory ran out"
     return PipelineError(
         what, where=where, expected=expected, remedy=f"see the system's log, use fewer workers, and {GO_ON}"
@@ -73,8 +78,11 @@ def ended(what: str, where: str | None = None) -> PipelineError:
 
 @contextmanager
 def _ended(cluster: Any) -> Iterator[Any]:
-    """End the workers. On a busy machine they may take longer than Dask waits: they then end with this process, and
-    what they finished counts."""
+    """End the workers when the block ends.
+
+    On a busy machine they may take longer than Dask waits. They then end with this process, and their finished work
+    counts.
+    """
     try:
         yield cluster
     finally:
@@ -83,7 +91,7 @@ def _ended(cluster: Any) -> Iterator[Any]:
 
 
 def _have_rendered_alike(client: Any) -> None:
-    """Have each worker of this machine render with what renders here, also those that come later."""
+    """Make each worker of this machine, later ones included, render with the device of this process."""
     from distributed import Worker, WorkerPlugin
 
     prepare = gl.WorkerSetup()
@@ -96,5 +104,5 @@ def _have_rendered_alike(client: Any) -> None:
 
 
 def _leave_interrupts_to_the_run() -> None:
-    """In a worker: Ctrl-C reaches all processes of a terminal, and the run ends its workers itself."""
+    """Ignore Ctrl-C in a worker: it reaches all processes of a terminal, and the run ends its workers itself."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""What a run's folder holds that can be made again: found with its sizes, and deleted; and what of it is stale."""
+"""Parts of a run's folder that stages can generate again: their sizes, their deletion, and stale datasets."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -35,7 +35,7 @@ class Part(NamedTuple):
     """Files and folders of a run's folder that belong together.
 
     Attributes:
-        made_by: the stages that make them, in words.
+        made_by: the stages that generate them, in words.
     """
 
     names: tuple[str, ...]
@@ -43,8 +43,10 @@ class Part(NamedTuple):
 
 
 def _with_failures(*formats: str) -> tuple[str, ...]:
-    """Datasets and records of some formats, which one stage makes."""
-    names = [name for one in formats for name in (one, f"{one}.json")]
+    """Name the datasets and records of formats that one stage generates, those of failures included."""
+    names: list[str] = []
+    for dataset in formats:
+        names += [dataset, f"{dataset}.json"]
     return (*names, *(f"{FAILURES}/{name}" for name in names))
 
 
@@ -61,11 +63,11 @@ PARTS = {
         "plan, manifest, validate and others",
     ),
 }
-"""Least to make again first."""
+"""Name to part; the part that takes the least work to generate again comes first."""
 
 
 def say_stale(part: str, run: Run) -> None:
-    """Say which datasets of a part of ``PARTS`` are there though nothing asks for them now."""
+    """Print which datasets of a part of ``PARTS`` exist although the configuration does not ask for them."""
     asked = {dataset.folder for dataset in (*run.formats, *run.failure_formats)}
     for folder in map(run.path, PARTS[part].names):
         if folder.is_dir() and folder not in asked:
@@ -76,7 +78,7 @@ def say_stale(part: str, run: Run) -> None:
 
 
 def found(run: Run, parts: Iterable[str]) -> dict[str, float]:
-    """Map the parts that are there to their megabytes."""
+    """Map each part that exists to its size in MB."""
     sizes_mb = {}
     for part in parts:
         paths = [path for path in map(run.path, PARTS[part].names) if path.exists()]
@@ -89,18 +91,20 @@ def delete(run: Run, parts: Iterable[str]) -> None:
     """Delete parts of a run's folder.
 
     Raises:
-        PipelineError: when the folder is not marked as that of a run, a stage of the run is running, or a part holds
-            files that no stage made.
+        PipelineError: when the folder has no mark of a run, a stage of the run is running, or a part holds files that
+            no stage generated.
     """
     refuse_unmarked(run.folder)
     with locked(run.folder):
-        refuse_foreign_files(run.folder, [name for part in parts for name in PARTS[part].names])
+        names: list[str] = []
         for part in parts:
-            for name in PARTS[part].names:
-                remove(run.path(name))
+            names += PARTS[part].names
+        refuse_foreign_files(run.folder, names)
+        for name in names:
+            remove(run.path(name))
 
 
 def size_mb(path: Path) -> float:
-    """Megabytes of a file, or of all files in a folder; 0 where nothing is."""
+    """Return the size of a file, or of all files in a folder, in MB; 0 if the path does not exist."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.lstat().st_size for file in files if file.is_file()) / 1e6

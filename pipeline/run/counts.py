@@ -1,6 +1,6 @@
-"""The numbers of a run: how many of its episodes were planned, replayed and kept.
+"""Numbers of a run: how many of its episodes were planned, replayed and kept.
 
-Every number of ``counts.json``, of the stage ``summary``, the report and the card is counted here, from the manifest.
+This module counts every number of ``counts.json``, the stage ``summary``, the report and the card, from the manifest.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Counts:
-    """Of the rows among some that were ``tried``, so that ``planned - kept`` is what was lost on the way."""
+    """Numbers of the ``tried`` rows; ``planned - kept`` is the number of episodes that were lost."""
 
     planned: int
     replayed: int
@@ -34,9 +34,13 @@ class Counts:
 
     @classmethod
     def of(cls, rows: Rows, **values: str) -> Counts:
-        """Of the rows that have these values, such as ``axis="camera"``."""
-        found = [row for row in tried(rows) if all(row[name] == value for name, value in values.items())]
-        return cls(len(found), sum(bool(row["steps"]) for row in found), sum(row["kept"] for row in found))
+        """Count the rows that have these values, such as ``axis="camera"``."""
+        matching = tried(rows)
+        for column, value in values.items():
+            matching = [row for row in matching if row[column] == value]
+        replayed = sum(bool(row["steps"]) for row in matching)
+        kept = sum(row["kept"] for row in matching)
+        return cls(len(matching), replayed, kept)
 
     def __str__(self) -> str:
         return f"{self.planned}/{self.replayed}/{self.kept}" if self.planned else "-"
@@ -44,12 +48,12 @@ class Counts:
 
 @dataclass(frozen=True)
 class Target:
-    """Episodes of an axis or combination, those that ``export.where`` leaves out included.
+    """Numbers of episodes of an axis or combination; episodes that ``export.where`` leaves out count too.
 
     Attributes:
-        wanted: as ``plan.episodes`` has it; of ``clean``, the demonstrations.
-        planned: of these, how many the plan has perturbations for.
-        kept: how many reached their goal with frames that show enough.
+        wanted: the number in ``plan.episodes``; for ``clean``, the number of demonstrations.
+        planned: number of wanted episodes for which the plan has perturbations.
+        kept: number of episodes that reached their goal and whose frames show enough.
     """
 
     wanted: int
@@ -58,10 +62,10 @@ class Target:
 
 
 def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
-    """Axis or combination to its target, ``clean`` first.
+    """Map each axis or combination to its target, ``clean`` first.
 
     Args:
-        episodes: ``plan.episodes``; where it lacks an axis, what is planned counts as wanted.
+        episodes: ``plan.episodes``. For an axis that it lacks, the planned number counts as wanted.
     """
     planned = Counter(row["axis"] for row in rows if row["wanted"])
     kept = Counter(row["axis"] for row in rows if row["reason"] in MADE)
@@ -70,7 +74,7 @@ def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
 
 
 def shortfalls(found: Mapping[str, Target]) -> list[str]:
-    """A sentence for each axis that has fewer kept episodes than wanted, with the setting that helps."""
+    """Write a sentence for each axis that has fewer kept episodes than wanted, with the setting that helps."""
     sentences = []
     for axis, target in found.items():
         if axis == CLEAN or target.kept >= target.wanted:
@@ -84,7 +88,7 @@ def shortfalls(found: Mapping[str, Target]) -> list[str]:
 
 
 def beyond_step_limit(rows: Rows) -> list[str]:
-    """Say which kept episodes take longer than an evaluation allows; empty where none does."""
+    """Report the kept episodes that take more steps than an evaluation allows; empty if there are none."""
     beyond = [row for row in rows if row["kept"] and row["exceeds_step_limit"]]
     if not beyond:
         return []
@@ -97,48 +101,57 @@ def beyond_step_limit(rows: Rows) -> list[str]:
 
 
 def tried(rows: Rows) -> list[Mapping[str, Any]]:
-    """All rows but the reserves that were not needed, and those that ``export.where`` leaves out, whatever became of
-    them: without what they gave, their losses are no yield."""
+    """Return all rows except unneeded reserves and rows that ``export.where`` leaves out.
+
+    Rows that ``export.where`` leaves out are never kept, so their losses alone would give a wrong yield.
+    """
     return [row for row in rows if row["reason"] != NOT_NEEDED and row["chosen"]]
 
 
 def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
-    """Episode id to row of the clean twins of kept episodes, as far as they were kept or ``export.where`` alone leaves
-    them out: their trajectories and frames are there."""
+    """Map the episode ids of the clean twins of kept episodes to their rows.
+
+    Only twins that were kept, or that ``export.where`` alone leaves out, are returned: their trajectories and frames
+    are stored.
+    """
     wanted = {row["twin_id"] for row in rows if row["kept"]}
-    made = (row for row in rows if row["reason"] in MADE)
-    return {row["episode_id"]: row for row in made if row["episode_id"] in wanted}
+    stored = [row for row in rows if row["reason"] in MADE]
+    return {row["episode_id"]: row for row in stored if row["episode_id"] in wanted}
 
 
 def named(rows: Rows, column: str) -> list[str]:
-    """The values of a column, each once, in the order in which they come."""
+    """List the values of a column, each once, in the order of their first rows."""
     return list(dict.fromkeys(row[column] for row in rows))
 
 
 def origins(rows: Rows, source: str) -> Counter[str]:
-    """Who made the demonstrations of some rows, to how many: ``human``, ``recorded`` or ``expanded``.
+    """Count the demonstrations of some rows by origin: ``human``, ``recorded`` or ``expanded``.
 
     Args:
-        source: of the run's demonstrations. Who recorded an HDF5 file, a person or a policy, is not known.
+        source: source of the run's demonstrations. An HDF5 file does not state if a person or a policy recorded it.
     """
-    made = Counter({row["demo_id"]: row["demo_origin"] for row in rows}.values())
-    if source == "hdf5" and HUMAN in made:
-        made["recorded"] = made.pop(HUMAN)
-    return made
+    origin_of = {row["demo_id"]: row["demo_origin"] for row in rows}
+    numbers = Counter(origin_of.values())
+    if source == "hdf5" and HUMAN in numbers:
+        numbers["recorded"] = numbers.pop(HUMAN)
+    return numbers
 
 
 def tally(rows: Rows, column: str) -> dict[str, Counter[str]]:
-    """Axis to how often each value of a column occurs on it."""
-    return {axis: Counter(row[column] for row in of_axis) for axis, of_axis in by_axis(rows).items()}
+    """Map each axis to the number of its rows with each value of a column."""
+    counters: dict[str, Counter[str]] = {}
+    for axis, rows_of_axis in by_axis(rows).items():
+        counters[axis] = Counter(row[column] for row in rows_of_axis)
+    return counters
 
 
 def by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
-    """Axis to its rows."""
+    """Map each axis to its rows."""
     return grouped((row["axis"], row) for row in rows)
 
 
 def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:
-    """``counts.json``: axis to suite to the number of episodes planned, replayed and kept."""
+    """Return the content of ``counts.json``: axis to suite to the numbers of episodes planned, replayed and kept."""
     table: dict[str, dict[str, dict[str, int]]] = {}
     for axis, suite in dict.fromkeys((row["axis"], row["suite"]) for row in tried(rows)):
         table.setdefault(axis, {})[suite] = asdict(Counts.of(rows, axis=axis, suite=suite))
@@ -146,7 +159,7 @@ def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:
 
 
 def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
-    """The same as a table for people, with totals and the episodes that are wanted.
+    """Return the counts by axis and suite as a table for people, with totals and wanted episodes.
 
     Args:
         episodes: ``plan.episodes``.
@@ -155,16 +168,17 @@ def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
 
     suites, axes = named(rows, "suite"), named(tried(rows), "axis")
     heads = [suite.removeprefix("libero_") for suite in suites]
-    found = targets(rows, episodes)
+    target_of = targets(rows, episodes)
     table = Table("axis", *heads, "all", "wanted", title="planned/replayed/kept episodes")
     for column in table.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for axis in axes:
         cells = [Counts.of(rows, axis=axis, suite=suite) for suite in suites]
+        in_all = Counts.of(rows, axis=axis)
         # A combination's name may break behind a +.
-        of_axis = Counts.of(rows, axis=axis), found[axis].wanted
-        table.add_row(axis.replace("+", "+ "), *map(str, (*cells, *of_axis)))
-    wanted = sum(target.wanted for target in found.values())
+        table.add_row(axis.replace("+", "+ "), *map(str, cells), str(in_all), str(target_of[axis].wanted))
+    wanted = sum(target.wanted for target in target_of.values())
+    totals = [Counts.of(rows, suite=suite) for suite in suites]
     table.add_section()
-    table.add_row("all", *(str(Counts.of(rows, suite=suite)) for suite in suites), str(Counts.of(rows)), str(wanted))
+    table.add_row("all", *map(str, totals), str(Counts.of(rows)), str(wanted))
     return table

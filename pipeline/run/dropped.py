@@ -1,7 +1,7 @@
 """Finished work that a changed configuration no longer needs: measured, and reported before a stage deletes it.
 
-The stages ``plan``, ``replay`` and ``render`` ask here before they replace or delete anything, and ``status`` and
-``doctor`` report the same.
+The stages ``plan``, ``replay`` and ``render`` call ``refuse_unasked`` before they replace or delete anything.
+``status`` and ``doctor`` report the result of ``measure``.
 """
 
 import os
@@ -23,7 +23,7 @@ from pipeline.stores.frame_store import shown_of
 from pipeline.types import Verdict
 
 LARGEST_SHARE = 0.1
-"""The share of the finished work that stages delete without a question."""
+"""Share of the finished work that stages delete without permission."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class Dropped:
     """Finished work that a plan does not need.
 
     Attributes:
-        trajectories: how many.
-        streams: how many streams of frames.
-        work_s: seconds of one core that these took.
-        share: of all trajectories and frames, by that time, in [0, 1].
-        episodes: of the datasets; their trajectories and frames may have been deleted before.
-        episode_share: of all episodes of the datasets, in [0, 1].
+        trajectories: number of trajectories.
+        streams: number of streams of frames.
+        work_s: time that one core needed for them, in s.
+        share: their share of the time for all trajectories and frames, in [0, 1].
+        episodes: number of episodes of the datasets; their trajectories and frames may have been deleted before.
+        episode_share: share of all episodes of the datasets, in [0, 1].
     """
 
     trajectories: int = 0
@@ -48,7 +48,7 @@ class Dropped:
 
     @property
     def asks(self) -> bool:
-        """Whether a person must allow it."""
+        """Return whether a person must allow the deletion."""
         return max(self.share, self.episode_share) > LARGEST_SHARE
 
     def __bool__(self) -> bool:
@@ -69,8 +69,7 @@ class Dropped:
 def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
     """Measure the finished work that the stages ``replay``, ``render`` and ``export`` would delete under a plan.
 
-    An episode counts as needed while it is not known whether it is: where it, or a candidate before it, is not
-    replayed or not rendered yet.
+    An undecided episode counts as needed: it, or a candidate before it, is not replayed or not rendered yet.
     """
     trajectories, streams = _needed(rows, run)
     speed = machine.known_speed(run) or REFERENCE
@@ -85,13 +84,14 @@ def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
         dropped_s += took_s * (name in unneeded)
     settings = run.frames.settings_by_fingerprint()
     for name, row in run.frames.rows_of_all_settings().items():
-        other = settings.get(row["made_by"], encoded) != encoded
-        of_file = {(name.split("/")[0], stream) for stream in row["streams"]}
-        gone = of_file if other else of_file - streams
+        encoded_otherwise = settings.get(row["made_by"], encoded) != encoded
+        trajectory_id = name.split("/")[0]
+        stored = {(trajectory_id, stream) for stream in row["streams"]}
+        unneeded_of_file = stored if encoded_otherwise else stored - streams
         stream_s = row["steps"] * frame_s(speed)
-        all_s += len(of_file) * stream_s
-        dropped_s += len(gone) * stream_s
-        unneeded_streams += len(gone)
+        all_s += len(stored) * stream_s
+        dropped_s += len(unneeded_of_file) * stream_s
+        unneeded_streams += len(unneeded_of_file)
     exported = _exported(run)
     gone_episodes = len(exported - {row.episode_id for row in rows})
     return Dropped(
@@ -105,10 +105,10 @@ def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
 
 
 def refuse_unasked(rows: Sequence[plan.Row], run: Run) -> None:
-    """Print how much finished work a plan drops, and stop where it is much and nobody allowed it.
+    """Print how much finished work a plan drops, and stop if it is much and nobody allowed the deletion.
 
     Raises:
-        PipelineError: when it is more than ``LARGEST_SHARE``. Nothing was changed.
+        PipelineError: when the share is above ``LARGEST_SHARE`` and ``REMAKE=1`` is not set. Nothing was changed.
     """
     dropped = measure(rows, run)
     if dropped.asks and os.environ.get(REMAKE) != "1":
@@ -124,16 +124,16 @@ def refuse_unasked(rows: Sequence[plan.Row], run: Run) -> None:
 
 
 def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str, str]]]:
-    """Ids of the trajectories that a plan may need, and of the streams, each with its trajectory's."""
+    """Return the ids of the trajectories that a plan may need, and pairs of trajectory id and id of a needed stream."""
     config = run.config
     verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
-    shown = shown_of(run.frames.rows())
-    rejected = rejections(rows, shown)
-    unknown = Verdict(False, NOT_REPLAYED)
-    # Reserves are needed unless candidates before them are known to be kept, frames included.
-    known = {row.trajectory_id: verdicts.get(row.trajectory_id, unknown) for row in rows}
-    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not rendered(row, shown)}
-    judged = select(rows, known, not_rendered | rejected)
+    frames = shown_of(run.frames.rows())
+    rejected = rejections(rows, frames)
+    undecided = Verdict(False, NOT_REPLAYED)
+    # A reserve is needed unless the candidates before it are replayed, rendered and kept.
+    verdict_of = {row.trajectory_id: verdicts.get(row.trajectory_id, undecided) for row in rows}
+    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not rendered(row, frames)}
+    judged = select(rows, verdict_of, not_rendered | rejected)
     trajectories: set[str] = set()
     streams: set[tuple[str, str]] = set()
     failures = MISSED if config.export.failures else ()
@@ -148,10 +148,10 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
 
 
 def _exported(run: Run) -> set[str]:
-    """Ids of the episodes in the finished datasets that the run would replace."""
+    """Return the ids of the episodes in the finished datasets that the run would replace."""
     exported: set[str] = set()
     for target in (*run.formats, *run.failure_formats):
-        with suppress(PipelineError):  # There is none.
+        with suppress(PipelineError):  # The dataset has no record.
             exported |= target.record().places.keys()
     return exported
 

@@ -1,4 +1,4 @@
-"""From the plan and the rendered streams to the Episode that a writer puts into a dataset."""
+"""Loader that joins the plan and the rendered streams to the Episode that a writer puts into a dataset."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,11 +19,11 @@ from pipeline.types import Episode, Extra, Subtask
 
 @dataclass(frozen=True)
 class EpisodeLoader:
-    """Loads rendered episodes by id; small enough to send to a worker, which reads the plan once for itself.
+    """Loader of rendered episodes by id, small enough to send to a worker, which reads the plan once itself.
 
     Attributes:
         extras: ``outcome`` for failures.
-        rewrites: episode id to other wordings of its task, where episodes come with them and with their subtasks.
+        rewrites: episode id to other wordings of its task. Episodes get rewrites and subtasks only if it is set.
     """
 
     data: Path
@@ -37,31 +37,32 @@ class EpisodeLoader:
 
     def __call__(self, episode_id: str) -> Episode:
         row = _rows_by_id(edition(self.data / "plan.parquet"))[episode_id]
-        shown = streams_of(row.perturbations)
-        geometry = {view: stream.geometry.stream_id for view, stream in shown.items()}
-        rendered = self._frames.load(row.trajectory_id, [s.stream_id for s in shown.values()], set(geometry.values()))
-        known = asdict(row) | {"replay_mode": rendered.replay_mode}
-        known |= asdict(rendered.quality) if rendered.quality else {}
-        known |= {f"{name}_version": version for name, version in versions().items()}
+        streams = streams_of(row.perturbations)
+        stream_ids = [stream.stream_id for stream in streams.values()]
+        geometry = {view: stream.geometry.stream_id for view, stream in streams.items()}
+        rendered = self._frames.load(row.trajectory_id, stream_ids, set(geometry.values()))
+        values = asdict(row) | {"replay_mode": rendered.replay_mode}
+        values |= asdict(rendered.quality) if rendered.quality else {}
+        values |= {f"{name}_version": version for name, version in versions().items()}
         if "outcome" in self.extras:
             verdict = TrajectoryStore(self.data / "trajectories").load(row.trajectory_id).verdict
-            known |= {"success": verdict.kept, "reason": verdict.reason}
+            values |= {"success": verdict.kept, "reason": verdict.reason}
         episode = Episode(
             episode_id=episode_id,
-            frames={view: rendered.streams[stream.stream_id] for view, stream in shown.items()},
+            frames={view: rendered.streams[stream.stream_id] for view, stream in streams.items()},
             state=rendered.state,
             joint_state=rendered.joint_state,
             action=rendered.action,
             instruction=row.instruction,
-            provenance={name: known[name] for name in provenance_of(self.extras)},
+            provenance={name: values[name] for name in provenance_of(self.extras)},
             geometry={view: rendered.geometry[name] for view, name in geometry.items()},
             object_poses=rendered.object_poses,
             instances=rendered.instances,
         )
         if self.rewrites is None:
             return episode
-        done = _subtasks(self.data / "trajectories", row.trajectory_id, row.suite, row.task)
-        return replace(episode, rewrites=self.rewrites[episode_id], subtasks=done)
+        subtasks = _subtasks(self.data / "trajectories", row.trajectory_id, row.suite, row.task)
+        return replace(episode, rewrites=self.rewrites[episode_id], subtasks=subtasks)
 
 
 @lru_cache(maxsize=1)
@@ -71,7 +72,7 @@ def _rows_by_id(plan_file: Edition) -> dict[str, plan.Row]:
 
 @lru_cache(maxsize=10_000)
 def _subtasks(trajectories: Path, trajectory_id: str, suite: str, task: str) -> tuple[Subtask, ...]:
-    """Episodes share trajectories, and come in no order."""
-    from pipeline.physics.subtasks import subtasks  # others need no simulator
+    """Return the subtasks of a trajectory; cached, as episodes share trajectories and come in no order."""
+    from pipeline.physics.subtasks import subtasks  # Only episodes with subtasks need the simulator.
 
     return subtasks(TrajectoryStore(trajectories).load(trajectory_id), find_task(suite, task))

@@ -1,7 +1,8 @@
-"""New demonstrations from old ones: other starts of the arm, other places of things, in LIBERO's own HDF5 layout.
+"""New demonstrations from old ones: other starts of the arm and other object poses, in LIBERO's own HDF5 layout.
 
-For whoever cannot reach the hub's 50 demonstrations of each task: the starter set's one human demonstration becomes
-many, made by the planner and the replay that also make the datasets, and marked as expanded wherever they are used.
+An expansion replaces the hub's 50 demonstrations of each task where the hub cannot be reached. It generates many
+demonstrations from the starter set's one human demonstration, with the planner and the replay of the datasets. They are
+marked as expanded wherever they are used.
 """
 
 from __future__ import annotations
@@ -39,29 +40,30 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Scene, State, Task, Trajectory
 
 RESERVE = 2.0
-"""Candidates drawn beyond those wanted, as a share: poses that collide are refused, and not every replay succeeds."""
+"""Share of candidates sampled in addition to the wanted ones: colliding poses are rejected, and some replays fail."""
 
 START_NORM_RAD = (0.1, 0.2, 0.3, 0.4, 0.5)
-"""Norms of the offsets of the arm's start, by level: a demonstration begins further away than an episode by default."""
+"""Norms of the offsets of the arm's start, by level; by default larger for a demonstration than for an episode."""
 
 ROUGH = {"steps": 1.5, "path_m": 1.5, "jerk_rms_m_s3": 2.0}
 """Largest multiples of the human's episode length, path length and jerk that count as smooth."""
 
 APART_RAD, APART_M = 0.05, 0.005
-"""Two demonstrations of a task are the same when their arms start closer than this, and every object of theirs does."""
+"""Two demonstrations of a task are duplicates if their arms and all their objects start closer than this."""
 
 REPLAY = ReplayConfig(mode="auto", noops="keep", settle_steps=0)
-"""No-ops are kept and nothing settles first, as in LIBERO's files: whoever reads them drops what they do not want, and
-settles as they want."""
+"""Replay settings that keep no-ops and do not settle first, as in LIBERO's files: their readers do both themselves."""
 
 
 @dataclass
 class Expansion:
-    """What came of it.
+    """Result of an expansion.
 
     Attributes:
+        files: files that were written.
+        written: number of demonstrations in them.
         dropped: reason to number of candidates.
-        short: task to the number of demonstrations that no candidate was left for.
+        short: task to the number of wanted demonstrations for which no candidate was left.
     """
 
     files: list[Path] = field(default_factory=list)
@@ -73,17 +75,17 @@ class Expansion:
 def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: int, workers: Workers) -> Expansion:
     """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
-    A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those
-    before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was. The files of an
-    earlier expansion are replaced, or deleted where a task gets no demonstration.
+    A candidate is kept if it reaches the goal, moves about as smoothly as the human and starts unlike the candidates
+    before it. Replays are stored in ``<out>/.replays``, so that a stopped expansion resumes. The files of an earlier
+    expansion are replaced, or deleted if a task gets no demonstration.
 
     Args:
-        demos: what the candidates are made from.
-        rows: what ``candidates`` or ``resets`` drew for as many demonstrations.
+        demos: demonstrations that the candidates perturb.
+        rows: plan of ``candidates`` or ``resets`` for the same ``per_task``.
 
     Raises:
-        PipelineError: when a demonstration cannot be read, finished replays would be made anew unasked, or a file of
-            other demonstrations is there.
+        PipelineError: when a demonstration cannot be read, finished replays would be generated again without
+            permission, or a file of other demonstrations would be replaced.
     """
     file_of = {entry.task: out / entry.task.suite / f"{entry.task.name}_demo.hdf5" for entry in demos.index().entries}
     for file in file_of.values():
@@ -95,21 +97,22 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
         verdicts = Replays(demos, REPLAY, store.root, workers).of(rows, faults)
         outcome = selection.select(rows, verdicts, faults)
         kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
-        if not (found := _faults(kept, rows, store)):
+        new_faults = _faults(kept, rows, store)
+        if not new_faults:
             break
-        faults |= found
-    unwanted = {"kept", selection.NOT_NEEDED}
+        faults |= new_faults
+    not_dropped = {"kept", selection.NOT_NEEDED}
     reasons = [outcome[row.episode_id].reason for row in rows if row.role == "perturbed"]
-    result = Expansion(dropped=Counter(reason for reason in reasons if reason not in unwanted))
+    result = Expansion(dropped=Counter(reason for reason in reasons if reason not in not_dropped))
     by_task = grouped((f"{row.suite}/{row.task}", row) for row in kept)
     for task, file in file_of.items():
-        made = by_task.get(name := str(task), [])
-        if len(made) < per_task:
-            result.short[name] = per_task - len(made)
-        if made:
-            hdf5.write(file, task, (_recording(store.load(row.trajectory_id), row) for row in made))
+        rows_of_task = by_task.get(str(task), [])
+        if len(rows_of_task) < per_task:
+            result.short[str(task)] = per_task - len(rows_of_task)
+        if rows_of_task:
+            hdf5.write(file, task, (_recording(store.load(row.trajectory_id), row) for row in rows_of_task))
             result.files.append(file)
-            result.written += len(made)
+            result.written += len(rows_of_task)
         else:
             remove(file)
     return result
@@ -129,32 +132,42 @@ def _refuse_other_demonstrations(file: Path) -> None:
 
 
 def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
-    """A plan for ``expand``: in every candidate the arm starts elsewhere, and the target stands elsewhere where the
-    task moves an object, with all of the scene where it stands on or in something; where the task only opens or turns
-    something, the arm alone."""
+    """Plan candidates for ``expand`` in which the arm, and the objects that the task moves, start elsewhere.
+
+    The arm starts elsewhere in every candidate. If the task moves an object, the object's pose changes too; if the
+    object stands on or in another one, the whole scene moves. If the task only opens or turns something, nothing but
+    the arm's start changes.
+    """
     by_moved: dict[Literal["target", "scene"] | None, list[DemoEntry]] = defaultdict(list)
     for entry in demos.index().entries:
-        known = bddl.read(entry.task.bddl_file)
-        carried = any(known.carriers[name] != name for name in known.targets)
-        by_moved[("scene" if carried else "target") if known.targets else None].append(entry)
+        definition = bddl.read(entry.task.bddl_file)
+        carried = any(definition.carriers[name] != name for name in definition.targets)
+        moved_by_task: Literal["target", "scene"] | None = None
+        if definition.targets:
+            moved_by_task = "scene" if carried else "target"
+        by_moved[moved_by_task].append(entry)
     rows: list[plan.Row] = []
     for moved, group in by_moved.items():
         pose = PoseAxis(components=(moved,)) if moved else None
         robot = RobotAxis(components=("initial_joints",), initial_norm_rad=START_NORM_RAD)
         axes = Axes(pose=pose, robot=robot)
-        episodes = {"pose+robot" if moved else "robot": per_task * len({entry.task for entry in group})}
+        tasks = {entry.task for entry in group}
+        episodes = {"pose+robot" if moved else "robot": per_task * len(tasks)}
         rows += plan.make(group, PlanConfig(seed=seed, axes=axes, episodes=episodes, reserve=RESERVE), REPLAY, test)
     return rows
 
 
 def resets(demos: DemosConfig, per_task: int, seed: int) -> list[plan.Row]:
-    """A plan for ``expand``: every candidate starts as LIBERO's recordings do, from a reset of its environment."""
+    """Plan candidates for ``expand`` that start like LIBERO's recordings: from a reset of its environment."""
     by_task = grouped((entry.task, entry) for entry in demos.index().entries)
-    return [row for group in by_task.values() for row in plan.resets(group, per_task, RESERVE, seed, REPLAY)]
+    rows: list[plan.Row] = []
+    for entries in by_task.values():
+        rows += plan.resets(entries, per_task, RESERVE, seed, REPLAY)
+    return rows
 
 
 def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: TrajectoryStore) -> dict[str, str]:
-    """Episode id to what is wrong with a replay that reached its goal, where something is."""
+    """Map episode ids to the faults of replays that reached their goals; replays without a fault are left out."""
     twins = {row.demo_id: row.trajectory_id for row in planned if row.role == "twin"}
     reasons = {trajectory_id: row["reason"] for trajectory_id, row in store.rows().items()}
     accepted: dict[tuple[str, str], list[_Motion]] = defaultdict(list)
@@ -162,11 +175,11 @@ def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: Trajec
     for row in rows:
         task, before = find_task(row.suite, row.task), accepted[row.suite, row.task]
         motion, twin = _motion(store, row.trajectory_id, task), twins[row.demo_id]
-        # Of a twin that workers were lost over there is nothing to compare with.
+        # A twin over which workers were lost has no motion to compare with.
         human = motion if reasons[twin] == LOST else _motion(store, twin, task)
         if any(motion.smoothness[name] > limit * human.smoothness[name] for name, limit in ROUGH.items()):
             faults[row.episode_id] = "not_smooth"
-        elif any(motion.starts_like(other) for other in before):
+        elif any(motion.starts_like(earlier) for earlier in before):
             faults[row.episode_id] = "duplicate"
         else:
             before.append(motion)
@@ -175,7 +188,13 @@ def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: Trajec
 
 @dataclass(frozen=True)
 class _Motion:
-    """What candidates are compared by; where the arm (7,) in rad and objects (N, 3) in m start."""
+    """Measures by which candidates are compared.
+
+    Attributes:
+        smoothness: result of ``quality.smoothness``.
+        joints_rad: (7,) start of the arm.
+        objects_m: (N, 3) start positions of the objects.
+    """
 
     smoothness: Mapping[str, float]
     joints_rad: Floats
@@ -198,30 +217,30 @@ def _motion(store: TrajectoryStore, trajectory_id: str, task: Task) -> _Motion:
 
 
 def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
-    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin.
+    """Convert a replay to a recording in LIBERO's layout, with its origin, but without images and this machine's paths.
 
-    As in LIBERO's files, states are those before each action and observations those after it.
+    As in LIBERO's files, states precede each action, and observations follow it.
     """
     compiled = CompiledScene(Scene(trajectory.model_xml, trajectory.states[0]))
-    robot, state, joints = [], [], []
+    robot, hands, joints = [], [], []
     for flattened in trajectory.states[1:]:
         compiled.restore(flattened)
         hand, arm = proprioception(compiled.data)
         w, *xyz = compiled.data.body("robot0_right_hand").xquat
         robot.append([*hand[6:], *hand[:3], *xyz, w])
-        state.append(hand)
+        hands.append(hand)
         joints.append(arm)
-    seen = np.array(state, np.float64)
+    hand_states = np.array(hands, np.float64)
     return hdf5.Recording(
         actions=trajectory.actions,
         states=trajectory.states[:-1],
         robot_states=np.array(robot, np.float64),
         model_file=portable(trajectory.model_xml),
         obs={
-            "ee_pos": seen[:, :3],
-            "ee_ori": seen[:, 3:6],
-            "ee_states": seen[:, :6],
-            "gripper_states": seen[:, 6:],
+            "ee_pos": hand_states[:, :3],
+            "ee_ori": hand_states[:, 3:6],
+            "ee_states": hand_states[:, :6],
+            "gripper_states": hand_states[:, 6:],
             "joint_states": np.array(joints, np.float64),
         },
         attrs={

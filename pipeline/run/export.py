@@ -1,8 +1,8 @@
-"""Bring a dataset up to date: what is finished stays, what a killed run had finished of it stays too.
+"""Update of a dataset: finished pieces stay, also the pieces that a killed run finished.
 
-Pieces are written into ``data/<run>/.work/<format>/<identity>/``, each under a temporary name that is renamed once it
-is whole. Then the dataset before is moved into ``.work``, the finished one takes its place, and its record is written.
-Only then is anything deleted, so that a kill at any moment leaves what the same command takes up again.
+Pieces are written into ``data/<run>/.work/<format>/<identity>/``, each under a temporary name that is renamed once the
+piece is whole. Then the earlier dataset is moved into ``.work``, the finished one takes its place, and its record is
+written. Nothing is deleted before that, so the same command resumes after a kill at any moment.
 """
 
 import json
@@ -45,19 +45,19 @@ from pipeline.types import Extra
 AnyFormat = Format[Any]
 
 OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]+\.json")
-"""File that OpenVLA-OFT's loader stores next to the shards; it would take it for those of a later dataset."""
+"""Name of the statistics that OpenVLA-OFT's loader stores next to the shards, and reuses even for a later dataset."""
 
 FINISHED = "record.json"
-"""File of a work folder: the record of its dataset, which is whole; later the record beside the dataset."""
+"""File of a work folder: the record of its whole dataset; later the record next to the dataset."""
 
 BEFORE = "before"
-"""Folder of a format's work folder: the dataset that was replaced, until the new one has its record."""
+"""Folder of a format's work folder: the replaced dataset, until the new one has its record."""
 
 
 def export_run(kind: type[AnyFormat], run: Run) -> None:
-    """Bring a run's dataset of one format up to date, and say what was done.
+    """Bring a run's dataset of one format up to date, and print what was done.
 
-    One that is not asked for is left as it is: where there is none, its record is an empty one.
+    A dataset that the configuration does not ask for stays as it is; without a record it gets an empty one.
     """
     options = run.config.export.formats.get(kind.name)
     if options is None:
@@ -88,27 +88,31 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
 
 
 def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
-    """Stop where the format's folder has entries that no export wrote, as a dataset is replaced as a whole.
+    """Stop if the format's folder has entries that no export wrote, as a dataset is replaced as a whole.
 
     Raises:
-        PipelineError: when an entry is no set of the dataset there and none of the dataset to write, or when a set has
-            a file that its record does not list.
+        PipelineError: when an entry is no set of the stored dataset or of the dataset to write, or when a set has a
+            file that its record does not list.
     """
-    own = target.sets(target.pieces(episodes)) if episodes.ids else set()
-    records = [Export(**read_json(file)) for file in target.work.glob(f"*/{FINISHED}")]  # of killed calls
-    with suppress(PipelineError):  # There is none, or the dataset has changed since.
+    sets = target.sets(target.pieces(episodes)) if episodes.ids else set()
+    # Records in the work folder are of killed calls.
+    records = [Export(**read_json(file)) for file in target.work.glob(f"*/{FINISHED}")]
+    with suppress(PipelineError):  # The dataset has no record, or has changed since.
         records.append(target.record())
+    recorded: set[str] = set()
     for record in records:
-        own |= {name.partition("/")[0] for name in record.files}
-    foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in own)
+        recorded |= record.files.keys()
+    sets |= {name.partition("/")[0] for name in recorded}
+    foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in sets)
     if records and not foreign:
-        written = {name for record in records for name in record.files}
-        foreign = [path for path in _files(target.folder) if path.relative_to(target.folder).as_posix() not in written]
+        for path in _files(target.folder):
+            if path.relative_to(target.folder).as_posix() not in recorded:
+                foreign.append(path)
     if foreign:
         raise PipelineError(
             f"not of this run's {target.title}, and would be deleted ({len(foreign)} such)",
             where=foreign[0],
-            expected=f"only {', '.join(sorted(own))}",
+            expected=f"only {', '.join(sorted(sets))}",
             remedy=f"move it out of {target.folder}; to train on both, make a folder of links to them",
         )
 
@@ -120,34 +124,34 @@ def _files(folder: Path) -> list[Path]:
 
 
 def episodes_of(target: AnyFormat, run: Run) -> Episodes:
-    """What a dataset is made of: the kept episodes of a run, or its failures, in the order they are written.
+    """Return the episodes of a dataset in the order they are written: the kept episodes of a run, or its failures.
 
-    Where the format takes ``language``, they come with subtasks and with the rewrites that the run's language axis may
-    draw for them, or its default ranges.
+    If the format takes ``language``, the episodes have subtasks and rewrites. The rewrites are those that the run's
+    language axis may sample for the episode; without that axis, those of its default ranges.
     """
     failures = "outcome" in target.extras
     rewrites: dict[str, tuple[str, ...]] | None = {} if target.language else None
     outcome, language = run.outcome, run.config.plan.axes.language
-    known: dict[str, Known] = {}
-    for one in shuffled(outcome.missed) if failures else outcome.kept:
-        row, content = outcome.row_of[one], outcome.content(one)
+    episodes: dict[str, Known] = {}
+    for episode_id in shuffled(outcome.missed) if failures else outcome.kept:
+        row, content = outcome.row_of[episode_id], outcome.content(episode_id)
         if rewrites is not None:
-            rewrites[one] = wordings(language, row.suite, row.task, row.axis)
-            content = digest(content, rewrites[one])[:16]
+            rewrites[episode_id] = wordings(language, row.suite, row.task, row.axis)
+            content = digest(content, rewrites[episode_id])[:16]
         steps = outcome.trajectories[row.trajectory_id]["steps"]
-        known[one] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
+        episodes[episode_id] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
     extras: tuple[Extra, ...] = ("outcome",) if failures else ()
-    return Episodes(known, run.episodes(extras=extras, rewrites=rewrites))
+    return Episodes(episodes, run.episodes(extras=extras, rewrites=rewrites))
 
 
 @cache
 def wordings(axis: LanguageAxis | None, suite: str, task: str, axes: str) -> tuple[str, ...]:
-    """The rewrites that a run's language axis, or its default ranges, may draw for an episode of these axes."""
+    """List the rewrites that a language axis may sample for an episode of these axes; `None`: with default ranges."""
     return (axis or LanguageAxis()).wordings(find_task(suite, task), axes.split("+"), benchmark.load())
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:
-    """A short digest of everything that the bytes of a dataset depend on."""
+    """Return a short digest of everything that the bytes of a dataset depend on."""
     return digest(
         "export",
         target.name,
@@ -157,24 +161,24 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
         _options(target),
         target.extras,
         [[piece.path, piece.ids] for piece in target.pieces(episodes)],
-        [known.content for known in episodes.known.values()],
+        [episode.content for episode in episodes.known.values()],
     )[:16]
 
 
 def request(target: AnyFormat, episodes: Episodes) -> str:
-    """A short digest of what of it was asked for: the episodes with all that they are, and the options."""
-    content = [known.content for known in episodes.known.values()]
+    """Return a short digest of the requested part of ``identity``: the episodes with their content, and the options."""
+    content = [episode.content for episode in episodes.known.values()]
     return digest(_options(target), target.extras, content)[:16]
 
 
 def _options(target: AnyFormat) -> dict[str, Any]:
-    """By the names that the fields had when they were first written."""
+    """Return a format's options under the field names of the first version that wrote them."""
     dumped: dict[str, Any] = target.options.model_dump(mode="json", by_alias=True)
     return dumped
 
 
 def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
-    """Why the finished dataset would be made anew although the same was asked for, to its number of files."""
+    """Count, by reason, the files of a finished dataset that would be generated again although the request is equal."""
     try:
         record = target.record()
     except PipelineError:
@@ -189,10 +193,10 @@ def _made_with(target: AnyFormat) -> dict[str, str]:
 
 
 def is_current(target: AnyFormat, episodes: Episodes) -> bool:
-    """Whether the dataset is there, whole and of these episodes.
+    """Return whether the dataset exists, is whole and has these episodes.
 
-    Every file must be there and no younger than the record. Statistics that a client stored in its sets are removed
-    then.
+    Every file must exist and be no younger than the record. If so, statistics that a client stored in the sets are
+    removed.
     """
     if not untouched(target) or target.record().identity != identity(target, episodes):
         return False
@@ -202,7 +206,7 @@ def is_current(target: AnyFormat, episodes: Episodes) -> bool:
 
 
 def untouched(target: AnyFormat) -> bool:
-    """Whether all files of a finished dataset are there, and none has changed since it was recorded."""
+    """Return whether all files of a finished dataset exist, and none has changed since it was recorded."""
     try:
         recorded = target.record_file.stat().st_mtime_ns
         return all((target.folder / name).stat().st_mtime_ns <= recorded for name in target.record().files)
@@ -211,31 +215,31 @@ def untouched(target: AnyFormat) -> bool:
 
 
 def notice_changes(target: AnyFormat) -> None:
-    """Delete the record of a finished dataset whose files are gone or have changed, so that it counts as not there."""
+    """Delete the record of a finished dataset whose files are missing or changed, so that it counts as missing."""
     if not target.record_file.exists() or untouched(target):
         return
     try:
         same = all(checksum(target.folder / name) == sha256 for name, sha256 in target.record().files.items())
     except (PipelineError, OSError):
         same = False
-    if same:  # Such as in a copy.
+    if same:  # A copy has other times.
         target.record_file.touch()
     else:
         target.record_file.unlink()
 
 
 def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
-    """Write a dataset, replacing the one before, and go on where a killed call with the same episodes was.
+    """Write a dataset, replacing the earlier one; resume the work of a killed call with the same episodes.
 
-    The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``workers``, and
-    not on how often the work was interrupted.
+    The bytes depend only on the episodes, their order, the options and the format's packages. They do not depend on
+    ``workers`` or on interruptions.
 
     Args:
-        workers: do the work; one call for each piece.
+        workers: get one call for each piece.
 
     Raises:
-        PipelineError: when an episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that
-            are whole stay in the work folder.
+        PipelineError: when an episode breaks the schema or the ids are unfit. The earlier dataset stays; whole pieces
+            stay in the work folder.
     """
     pieces = target.pieces(episodes)
     work = target.work / identity(target, episodes)
@@ -243,7 +247,7 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     finished = work / FINISHED
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, workers)
-        # In a worker, which has the format's packages loaded already.
+        # A worker has the format's packages loaded already.
         (places,) = workers(partial(_assembled, target, work), [pieces], f"{target.title} assembly")
         dataset = work / "dataset"
         sync(dataset)
@@ -257,17 +261,17 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
 
 
 def _replace(target: AnyFormat, work: Path) -> None:
-    """Put a finished dataset and its record in the place of the ones before.
+    """Replace the earlier dataset and its record with the finished ones.
 
-    Nothing is deleted until the record is written: a folder that is half deleted would have sets of no record.
+    Nothing is deleted until the record is written, as a partly deleted folder would have sets without a record.
 
     Args:
-        work: has the folder ``dataset``, unless a killed call moved it, and the record of it.
+        work: folder with the record, and with the folder ``dataset`` unless a killed call moved it.
     """
     if (work / "dataset").is_dir():
         if target.folder.exists():
             os.replace(target.folder, target.work / BEFORE)
-        target.record_file.unlink(missing_ok=True)  # It is about the dataset before.
+        target.record_file.unlink(missing_ok=True)  # This record is of the earlier dataset.
         put_in_place(work / "dataset", target.folder)
     (work / FINISHED).touch()  # No file of the dataset is younger than its record.
     put_in_place(work / FINISHED, target.record_file)
@@ -291,7 +295,7 @@ def _write_piece(target: AnyFormat, load: Load, todo: tuple[Path, Piece]) -> Non
 
 
 def _assembled(target: AnyFormat, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
-    # Without what a worker made that was lost in the middle of it.
+    # Delete what a lost worker left unfinished.
     keep_below(work, {work / piece.path for piece in pieces})
     return target.assemble(work, pieces)
 

@@ -1,4 +1,4 @@
-"""A stage whose outputs are few remembers what it made them from: where that is the same again, it does nothing.
+"""Memory of stages with few outputs: skip a stage if its inputs and recipe have not changed since its last call.
 
 The memory is a file of ``data/<run>/.finished/``. To have a stage work again, delete its output.
 """
@@ -44,15 +44,17 @@ from pipeline.stores.store import TABLE
 TRAJECTORIES_TABLE, FRAMES_TABLE = f"{TRAJECTORIES}/{TABLE}", f"{FRAMES}/{TABLE}"
 LIBRARY = Path(__file__).parents[1]
 SEEN = LIBRARY / "testset" / "seen.json"
-"""What a policy sees in test tasks, which the report shows beside what it sees in the run."""
+"""File of measures of the test tasks, which the report shows next to the measures of the run."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What a stage's outputs were made from.
+    """Record of the inputs and the recipe that a stage's outputs were generated from.
 
     Attributes:
-        made_by: the fingerprint of its inputs and recipe; None where an input has changed since it was recorded.
+        data: folder of the run.
+        stage: name of the stage.
+        made_by: fingerprint of inputs and recipe; `None` if an input has changed since it was recorded.
         outputs: files or folders of ``data``.
     """
 
@@ -62,14 +64,14 @@ class Memory:
     outputs: Sequence[str]
 
     def holds(self) -> bool:
-        """Whether the outputs are there as they were made, from the same inputs by the same recipe."""
+        """Return whether the outputs are unchanged, and were generated from the same inputs by the same recipe."""
         try:
             return self.made_by is not None and read_json(self._file) == self._now()
         except (PipelineError, OSError):
             return False
 
     def keep(self) -> None:
-        """Remember the outputs as they are."""
+        """Record the present outputs."""
         self._file.unlink(missing_ok=True)
         if self.made_by is not None:
             write_json(self._file, self._now())
@@ -95,7 +97,7 @@ def of_stage(
     try:
         packages = [fingerprint(step) for step in RECIPES]
     except (PipelineError, PackageNotFoundError):
-        # The stage doctor names the fault.
+        # The stage `doctor` reports the fault.
         return Memory(run.folder, name, None, outputs)
     contents = _contents([run.path(file) for file in inputs], run.folder)
     made_by = digest(library(), packages, dict(settings), contents)
@@ -111,12 +113,13 @@ def library() -> str:
 
 
 def of_validate(run: Run) -> Memory:
-    """Of what ``validate`` found: it passed on these contents, of which nothing has changed."""
+    """Return the memory of ``validate``: it passed on these contents, and nothing has changed since."""
     stores, formats = (run.trajectories, run.frames), run.recorded_formats
     files = [run.path(name) for name in (PLAN, MANIFEST, COUNTS, STATISTICS, INPUTS)]
     files += [store.root / TABLE for store in stores]
     files += [dataset.record_file for dataset in formats]
-    whole = all(store.untouched() for store in stores) and all(untouched(dataset) for dataset in formats)
+    stores_whole = all(store.untouched() for store in stores)
+    whole = stores_whole and all(untouched(dataset) for dataset in formats)
     config = run.config
     sections = [settings_of(section) for section in (config.render, config.export, config.plan.axes)]
     settings = [*sections, checksum(BANK_FILE)]
@@ -125,30 +128,31 @@ def of_validate(run: Run) -> Memory:
 
 
 def of_doctor(run: Run, device: str) -> Memory:
-    """Of a trial of this machine."""
+    """Return the memory of a trial of this machine."""
     return Memory(run.folder, "trial", fingerprint("pixels", device, *host()), [MACHINE])
 
 
 def host() -> list[list[str]]:
-    """This machine's name and kernel, and the models of its processors."""
+    """Return this machine's name and kernel, and the models of its processors."""
     cpu = Path("/proc/cpuinfo")
-    models = {line for line in cpu.read_text().splitlines() if line.startswith("model name")} if cpu.exists() else {}
+    lines = cpu.read_text().splitlines() if cpu.exists() else []
+    models = {line for line in lines if line.startswith("model name")}
     return [list(platform.uname()), sorted(models)]
 
 
 def of_summary(run: Run) -> Memory:
-    """Of the contact sheets and previews."""
+    """Return the memory of the contact sheets and previews."""
     names = (PLAN, MANIFEST, INPUTS, FRAMES_TABLE)
     return _of_pictures(run, "summary", [SHEETS, PREVIEWS], _drawn_by(run.config), names)
 
 
 def of_previews(run: Run) -> Memory:
-    """Of the previews alone, which show no episode: what is kept and exported changes none."""
+    """Return the memory of the previews, which show no episode and so do not depend on kept or exported episodes."""
     return _of_pictures(run, "previews", [PREVIEWS], _drawn_by(run.config), [INPUTS])
 
 
 def of_report(run: Run) -> Memory:
-    """Of the report."""
+    """Return the memory of the report."""
     names = (PLAN, MANIFEST, LEAKAGE, INPUTS, FRAMES_TABLE, SHEETS, PREVIEWS)
     settings = [settings_of(run.config, {"compute", "folder", "publish"}), checksum(SEEN)]
     return _of_pictures(run, "report", [REPORT], settings, names)
@@ -167,13 +171,23 @@ def _drawn_by(config: Config) -> list[dict[str, Any]]:
 
 
 def _contents(paths: Sequence[Path], data: Path) -> Mapping[str, str]:
-    files = (file for path in paths for file in _files(path) if file.exists())
-    return {file.relative_to(data).as_posix(): checksum(file) for file in files}
+    contents: dict[str, str] = {}
+    for path in paths:
+        for file in _files(path):
+            if file.exists():
+                contents[file.relative_to(data).as_posix()] = checksum(file)
+    return contents
 
 
 def settings_of(section: BaseModel, but: Set[str] = frozenset()) -> dict[str, Any]:
-    """JSON-serialisable; of a path the name alone, as ``inputs.json`` tells what lies there."""
-    # By the names that the fields had when they were first written.
+    """Return the fields of a section, JSON-serialisable.
+
+    Paths are reduced to their last name, as ``inputs.json`` lists the content of the files.
+
+    Args:
+        but: fields to leave out.
+    """
+    # Aliases are the field names of the first version that wrote them.
     dumped = section.model_dump(exclude=set(but), by_alias=True)
     listed: dict[str, Any] = json.loads(json.dumps(dumped, default=lambda path: PurePath(path).name))
     return listed

@@ -1,4 +1,4 @@
-"""Files in a run's folder that no stage of the run made, and that a stage would delete."""
+"""Files in a run's folder that no stage of the run generated, and that a stage would delete."""
 
 import os
 import re
@@ -21,7 +21,7 @@ CLEARED = {
     "sheets": _SHEET,
     "previews": rf"[a-z0-9_]+/{_AXIS}\.png",
 }
-"""Folders of a run that stages clear, to a pattern of the paths that stages write in them."""
+"""Map of the folders that stages clear to a pattern of the paths that stages write in them."""
 
 MADE = {
     **CLEARED,
@@ -29,28 +29,29 @@ MADE = {
     "finetune": r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|"
     r"starvla_data_config\.py|openpi_assets/physical-intelligence/libero/norm_stats\.json",
 }
-"""The same, with the folders whose stages look for edits themselves. ``clean`` deletes all."""
+"""``CLEARED`` with the folders whose stages look for edits themselves. ``clean`` deletes all of them."""
 
 SHOWN = 3
-"""So many files are named in an error."""
+"""Number of files that an error names at most."""
 
 FILE_IN_USE = re.compile(r"\.nfs[0-9a-f]+")
 """Name that NFS gives to a deleted file until the last process closes it."""
 
 
 def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> None:
-    """Stop before a stage, or ``clean``, would delete files that no stage made.
+    """Stop before a stage, or ``clean``, would delete files that no stage generated.
 
     Args:
         data: the run's folder.
-        folders: keys of ``MADE``; others are ignored.
+        folders: keys of ``MADE``; other names are ignored.
 
     Raises:
         PipelineError: naming some of the files.
     """
-    if found := sorted(foreign_files(data, folders)):
-        names = ", ".join(path.relative_to(data).as_posix() for path in found[:SHOWN])
-        more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    foreign = sorted(foreign_files(data, folders))
+    if foreign:
+        names = ", ".join(path.relative_to(data).as_posix() for path in foreign[:SHOWN])
+        more = f" and {len(foreign) - SHOWN} more" if len(foreign) > SHOWN else ""
         raise PipelineError(
             f"holds files that no stage of this run made, and that would be deleted: {names}{more}",
             where=data,
@@ -60,15 +61,15 @@ def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) ->
 
 
 def foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> Iterator[Path]:
-    """Yield the files and links in ``folders`` of a run's folder that no stage made."""
+    """Yield the files and links in ``folders`` of a run's folder that no stage generated."""
     for name in MADE.keys() & {*folders}:
-        made, folder = re.compile(MADE[name]), data / name
+        pattern, folder = re.compile(MADE[name]), data / name
         for entry in _entries(folder):
-            inside = entry.path[len(str(folder)) + 1 :]
-            temporary = any(is_temporary(part) for part in inside.split(os.sep))
-            own = made.fullmatch(inside) and not entry.is_symlink()
-            if not (own or temporary or FILE_IN_USE.fullmatch(entry.name)):
-                yield folder / inside
+            path = entry.path[len(str(folder)) + 1 :]
+            temporary = any(is_temporary(part) for part in path.split(os.sep))
+            generated = pattern.fullmatch(path) and not entry.is_symlink()
+            if not (generated or temporary or FILE_IN_USE.fullmatch(entry.name)):
+                yield folder / path
 
 
 def _entries(folder: Path | str) -> Iterator[os.DirEntry[str]]:

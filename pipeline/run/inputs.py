@@ -1,8 +1,8 @@
-"""What DVC cannot read off a configuration: what it leaves to defaults, and what lies in the files that it names.
+"""Inputs of a run that DVC cannot read off a configuration: its defaults, and the content of the files that it names.
 
-Those are demonstrations, tasks of one's own, a bank of rewrites, folders of textures and objects. A stage writes out
-the configuration and lists these files each time, and other stages depend on that: a changed file is noticed, and where
-both are the same nothing runs again.
+These files are demonstrations, the user's own tasks, a bank of rewrites, folders of textures and objects. A stage
+writes out the configuration and lists these files each time, and other stages depend on both. A changed file is
+noticed; if nothing has changed, nothing runs again.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,7 +18,7 @@ from pipeline.libero.tasks import OWN, SUITES, select_tasks
 from pipeline.run.finished import host, settings_of
 
 HASHED_BYTES = 16_000_000
-"""Files up to this size are listed by their content; larger ones by size and time of change, as hashing takes long."""
+"""Largest size of a file that is listed by its content; larger files are listed by size and time of change."""
 
 
 SECTIONS = ("demos", "plan", "replay", "filter", "render", "export", "compute", "publish")
@@ -26,23 +26,26 @@ SECTIONS = ("demos", "plan", "replay", "filter", "render", "export", "compute", 
 
 
 def listing(config: Config) -> dict[str, list[str | int]]:
-    """Each file that the configuration's paths lead to, and what shows whether it has changed.
+    """Map each file that the configuration's paths lead to, to a state that differs once the file has changed.
 
-    A file is named by the field of the configuration and its path in the folder that stands there, such as
-    ``demos.root/libero_goal/turn_on_the_stove_demo.hdf5``: where that folder lies changes nothing.
+    A file's name is the field of the configuration and the file's path in the folder that the field names, such as
+    ``demos.root/libero_goal/turn_on_the_stove_demo.hdf5``. The place of that folder changes nothing.
     """
-    own = (task for task in select_tasks(config.demos.tasks) if task.suite not in SUITES)
-    return {
-        (PurePosixPath(field) / file.relative_to(path)).as_posix(): _state(file)
-        for field, path in _paths({name: section for name, section in config if name != "folder"})
-        for file in sorted(_files(path))
-    } | {f"{OWN}/{task}.bddl": _state(task.bddl_file) for task in own}
+    states: dict[str, list[str | int]] = {}
+    sections = {name: section for name, section in config if name != "folder"}
+    for field, path in _paths(sections):
+        for file in sorted(_files(path)):
+            states[(PurePosixPath(field) / file.relative_to(path)).as_posix()] = _state(file)
+    for task in select_tasks(config.demos.tasks):
+        if task.suite not in SUITES:
+            states[f"{OWN}/{task}.bddl"] = _state(task.bddl_file)
+    return states
 
 
 def settings(config: Config) -> dict[str, Any]:
-    """Every section that decides what is made, with all fields, and this machine.
+    """Return this machine and every section that decides what is generated, with all fields.
 
-    Of a path the last name, as for ``listing``.
+    Paths are reduced to their last name, as ``listing`` lists their files.
     """
     sections = {name: settings_of(getattr(config, name)) for name in SECTIONS}
     export = {"where": None, "lerobot_v21": None, "failures": False, **sections["export"]}
@@ -50,7 +53,7 @@ def settings(config: Config) -> dict[str, Any]:
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:
-    """Every path in a configuration, however deep, and its field, such as ``plan.axes.layout.sources.1.folder``."""
+    """Yield every path in a configuration, however deep, with its field: ``plan.axes.layout.sources.1.folder``."""
     if isinstance(value, Path):
         yield field.removeprefix("."), value
     elif isinstance(value, BaseModel):
@@ -65,8 +68,11 @@ def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:
 
 def _files(path: Path) -> Iterator[Path]:
     if path.is_dir():
-        # Without hidden files, which are records that downloads leave; with those of folders that are links.
-        yield from (file for name in glob("**", root_dir=path, recursive=True) if (file := path / name).is_file())
+        # glob skips hidden files, which are records that downloads leave, and follows folders that are links.
+        for name in glob("**", root_dir=path, recursive=True):
+            file = path / name
+            if file.is_file():
+                yield file
     elif path.exists():
         yield path
 

@@ -1,7 +1,7 @@
-"""Whether this machine still computes what it, or another, computed for a run: versions alone do not say that.
+"""Trial that shows whether this machine computes the same results as the machine that began a run.
 
-Ten control steps and a frame are tried. Their digests are recorded with what they were made with, and a run that has
-files goes on only where the same versions and the same device give the same digests.
+Versions alone do not show that. The trial computes ten control steps and a frame. Their digests are recorded with
+recipes, versions and device. A run that has files resumes only if the same versions and device give the same digests.
 """
 
 import hashlib
@@ -23,18 +23,23 @@ from pipeline.run.run import FINISHED, FRAMES, MACHINE, TRAJECTORIES, Run
 from pipeline.stores.store import SUFFIX
 
 SPEED = f"{FINISHED}/speed.json"
-"""File of a run's folder that says how fast the machine was, by which ``status`` knows the time that is left."""
+"""File of a run's folder with the speed of the machine, from which ``status`` estimates the remaining time."""
 
 STORES = {"ten steps": (TRAJECTORIES, FRAMES), "one frame": (FRAMES,)}
-"""What of a trial stands for the files of which folders."""
+"""Map of each part of a trial to the folders whose files it stands for."""
 
 TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
-"""What is simulated and rendered to see whether this machine still gives the same numbers and the same picture."""
+"""Task and number of control steps that a trial simulates and renders."""
 
 
 class Speed(NamedTuple):
-    """How fast this machine is: seconds of one core for a control step, and for a frame of the trial's scene by the
-    plain renderer: of the core, or of one of so many GPUs."""
+    """Speed of this machine.
+
+    Attributes:
+        step_s: time of one core for a control step.
+        frame_s: time for a frame of the trial's scene by the plain renderer, of one core or of one GPU.
+        gpus: number of GPUs; 0 if the processor renders.
+    """
 
     step_s: float
     frame_s: float
@@ -42,11 +47,11 @@ class Speed(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What a trial came to.
+    """Result of a trial.
 
     Attributes:
-        digests: of ten control steps and of a frame of their end, and the device that rendered it.
-        speed: of this machine.
+        digests: digests of ten control steps and of a frame after them, and the device that rendered the frame.
+        speed: speed of this machine.
     """
 
     digests: Mapping[str, str]
@@ -55,7 +60,7 @@ class Trial(NamedTuple):
 
 @cache
 def trial() -> Trial:
-    """Simulate and render a little, in some five seconds."""
+    """Simulate ten control steps and render a frame, in about five seconds."""
     from pipeline.physics.environment import Environment
     from pipeline.physics.replay import replay
     from pipeline.rendering.drawing import PlainDrawing
@@ -85,25 +90,29 @@ def trial() -> Trial:
 
 
 def _seconds(call: Callable[[], object], gpu: bool = False) -> float:
-    """Of the quickest of ten calls: of the processor, so that other work counts little, or on the clock for a GPU."""
-    return min(timeit.repeat(call, number=1, repeat=10, timer=time.perf_counter if gpu else time.process_time))
+    """Return the time of the quickest of ten calls, in s.
+
+    It is processor time, so that other work counts little; for a GPU it is wall-clock time.
+    """
+    timer = time.perf_counter if gpu else time.process_time
+    return min(timeit.repeat(call, number=1, repeat=10, timer=timer))
 
 
 def keep_speed(run: Run, speed: Speed) -> None:
-    """Write it down for ``status``; no file that is made depends on it."""
+    """Store the speed for ``status``; no generated file depends on it."""
     run.path(SPEED).parent.mkdir(exist_ok=True)
     write_json(run.path(SPEED), speed._asdict())
 
 
 def known_speed(run: Run) -> Speed | None:
-    """What ``keep_speed`` wrote last; None where it did not, or another version did."""
+    """Read the speed that ``keep_speed`` stored last; `None` if it stored none, or another version did."""
     file = run.path(SPEED)
-    found = read_json(file) if file.exists() else {}
-    return Speed(**found) if found.keys() == set(Speed._fields) else None
+    stored = read_json(file) if file.exists() else {}
+    return Speed(**stored) if stored.keys() == set(Speed._fields) else None
 
 
 def record(run: Run, trial: Mapping[str, str]) -> None:
-    """Write what is here, unless the run was begun where the trial came to something else.
+    """Record this machine's trial, unless the run was begun on a machine with another result.
 
     Raises:
         PipelineError: as ``refuse_another``.
@@ -114,11 +123,11 @@ def record(run: Run, trial: Mapping[str, str]) -> None:
 
 
 def refuse_another(run: Run, trial: Mapping[str, str]) -> None:
-    """Compare a trial with those that are recorded; nothing is written.
+    """Compare a trial with the recorded ones; nothing is written.
 
     Raises:
-        PipelineError: when another machine with the same versions and device came to something else, and files were
-            made. They would count as current, so that the run would be of two kinds.
+        PipelineError: when another machine with the same versions and device had another result and generated files.
+            They would count as up to date, so the run would mix two results.
     """
     recorded = trials(run)
     for name, digest in _named(trial).items():
@@ -134,7 +143,7 @@ def refuse_another(run: Run, trial: Mapping[str, str]) -> None:
 
 
 def trials(run: Run) -> dict[str, str]:
-    """What the run's folder has, by name; none where there is no record, or one of an earlier version."""
+    """Map the names of the recorded trials of a run to their digests; empty without a record of this version."""
     file = run.path(MACHINE)
     return dict(read_json(file).get("trials", {})) if file.exists() else {}
 

@@ -1,4 +1,4 @@
-"""The manifest: one row for every planned episode, kept or dropped and why, and where it lies in each dataset."""
+"""Manifest: one row for every planned episode, with the reason why it was dropped and its place in each dataset."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from pipeline.tables import column, columns_of, read_table, write_table
 from pipeline.types import Quality
 
 OWN_VERSION = "pipeline_version"
-"""The column for the version of this project, which is information: what is current, recipe numbers decide."""
+"""Column for the version of this project, for information only: recipe numbers decide which files are up to date."""
 
 _SETTINGS = b"settings"
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a planned episode: the columns after those of the plan, with what they mean."""
+    """Result of a planned episode: the columns after the columns of the plan, with their meanings."""
 
     kept: Annotated[bool, "in the datasets"]
     reason: Annotated[
@@ -63,11 +63,11 @@ class Result:
 
 
 class Settings(Frozen):
-    """What every episode of a run is made under, beside its own row: with both, it can be made again.
+    """Settings that all episodes of a run share; with them and its row, an episode can be generated again.
 
     Attributes:
-        source: ``starter`` or ``hdf5``; where its files lie differs from machine to machine.
-        episodes: ``plan.episodes``: how many were wanted. Manifests of earlier versions lack it.
+        source: ``starter`` or ``hdf5``, without the folder of the files, which differs from machine to machine.
+        episodes: ``plan.episodes``, the wanted numbers. Manifests of earlier versions lack it.
     """
 
     source: Literal["starter", "hdf5"]
@@ -88,17 +88,19 @@ class Settings(Frozen):
 def build(
     run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequence[pa.Field], where: Where | None
 ) -> pa.Table:
-    """Join the plan with what became of it.
+    """Join the plan with the results of its episodes.
 
     Args:
-        places: episode id to where it lies in the datasets, for every kept episode.
+        run: plan, verdicts and stored files of a run.
+        places: id of every kept episode to its place in the datasets.
+        columns: columns of ``places``.
         where: ``export.where``.
     """
-    own_versions = {version_column(name): version for name, version in versions().items()}
+    version_of_column = {version_column(name): version for name, version in versions().items()}
     table = []
     for row in run.rows:
         verdict = run.verdicts[row.episode_id]
-        # The trajectory of a reserve that was not needed may be there for another episode.
+        # The trajectory of a reserve that was not needed may be stored for another episode.
         replayed = run.trajectories.get(row.trajectory_id, {}) if verdict.reason != NOT_NEEDED else {}
         result = Result(
             kept=verdict.kept,
@@ -112,34 +114,34 @@ def build(
             gl_device=run.frames[row.trajectory_id].device if replayed and rendered(row, run.frames) else None,
         )
         quality = {each.name: replayed.get(each.name) for each in fields(Quality)}
-        table.append({**asdict(row), **asdict(result), **quality, **places.get(row.episode_id, {}), **own_versions})
+        place = places.get(row.episode_id, {})
+        table.append({**asdict(row), **asdict(result), **quality, **place, **version_of_column})
     return pa.Table.from_pylist(table, schema=schema(columns))
 
 
 def _ratio(replayed: Mapping[str, Any], twin: Mapping[str, Any]) -> float | None:
-    one, other = replayed.get("path_m"), twin.get("path_m")
-    return one / other if one is not None and other else None
+    path_m, twin_path_m = replayed.get("path_m"), twin.get("path_m")
+    return path_m / twin_path_m if path_m is not None and twin_path_m else None
 
 
 def version_column(name: str) -> str:
-    """The column that holds the version of a package."""
+    """Return the name of the column for the version of a package."""
     return f"{name.replace('-', '_')}_version"
 
 
 def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
-    """The columns: of the plan, its result and quality, where an episode lies in each dataset, and the versions."""
+    """Return the columns: the plan, its result and quality, the place in each dataset, and the versions."""
     made_by = [column(version_column(name), pa.string(), meaning) for name, meaning in VERSIONS.items()]
     return pa.schema([*columns_of(plan.Row), *columns_of(Result), *columns_of(Quality), *places, *made_by])
 
 
 def described(places: Sequence[pa.Field]) -> dict[str, Any]:
-    """``schemas/manifest.json``, for readers: every column."""
-    return {
-        "columns": [
-            {"name": each.name, "type": str(each.type), "meaning": each.metadata[b"meaning"].decode()}
-            for each in schema(places)
-        ]
-    }
+    """Return the content of ``schemas/manifest.json``, which describes every column for readers."""
+    columns = []
+    for each in schema(places):
+        meaning = each.metadata[b"meaning"].decode()
+        columns.append({"name": each.name, "type": str(each.type), "meaning": meaning})
+    return {"columns": columns}
 
 
 def write(table: pa.Table, path: Path, settings: Settings) -> None:
@@ -147,25 +149,26 @@ def write(table: pa.Table, path: Path, settings: Settings) -> None:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The rows of a manifest.
+    """Read the rows of a manifest.
 
     Raises:
-        PipelineError: when it is missing, damaged or not a manifest of this version.
+        PipelineError: when the file is missing, damaged or not a manifest of this version.
     """
     return list(read_table(path, schema().names, MAKE_AGAIN).to_pylist())
 
 
 def settings(path: Path) -> Settings:
-    """What the episodes of a manifest were made under.
+    """Read the settings that the episodes of a manifest share.
 
     Raises:
-        PipelineError: when the file does not say so, or has not the columns of this version.
+        PipelineError: when the file has no settings, or lacks columns of this version.
     """
     try:
-        found = pq.read_schema(path)
-        if lacking := set(schema().names) - set(found.names):
+        stored = pq.read_schema(path)
+        lacking = set(schema().names) - set(stored.names)
+        if lacking:
             raise KeyError(sorted(lacking))
-        return Settings.model_validate_json(found.metadata[_SETTINGS])
+        return Settings.model_validate_json(stored.metadata[_SETTINGS])
     except (OSError, pa.ArrowException, TypeError, KeyError, ValidationError) as error:
         raise PipelineError(
             f"not a manifest of this version ({error})",
@@ -176,5 +179,5 @@ def settings(path: Path) -> Settings:
 
 
 def made_with(row: Mapping[str, Any]) -> dict[str, str]:
-    """Package to the version that a row was made with."""
+    """Map each package to the version that a row was generated with."""
     return {DISTRIBUTION if name == "pipeline" else name: row[version_column(name)] for name in VERSIONS}

@@ -1,4 +1,4 @@
-"""What became of every planned episode: kept, or dropped and why."""
+"""Outcome of every planned episode: kept, or dropped for a reason."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,26 +19,29 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
 LEFT_OUT = "left_out"
-"""The reason why an episode that reached its goal is in no dataset: ``export.where`` does not name it."""
+"""Reason of an episode that reached its goal and is in no dataset because ``export.where`` does not name it."""
 
 MADE = ("kept", LEFT_OUT)
-"""The reasons of episodes whose trajectory and frames are there."""
+"""Reasons of episodes whose trajectory and frames are stored."""
 
 
 MISSED = ("goal_not_reached", "goal_lost")
-"""The reasons of failures: what was simulated to the end, and missed its goal. Good demonstrations do too: see the
-yields in docs/axes.md."""
+"""Reasons of failures: replays that were simulated to the end and missed their goal.
+
+Good demonstrations fail too: see the yields in docs/axes.md.
+"""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The plan, and what replay and rendering made of it.
+    """Plan of a run with the results of replay and rendering.
 
     Attributes:
+        rows: rows of the plan.
         trajectories: trajectory id to its row in the table of replays.
-        frames: trajectory id to what is stored of its frames.
+        frames: trajectory id to the record of its stored frames.
         verdicts: episode id to verdict.
-        missed: ids of the failures to write, in the order of the plan; none unless they are asked for.
+        missed: ids of the failures to write, in the order of the plan; empty unless ``export.failures`` is set.
     """
 
     rows: Sequence[plan.Row]
@@ -58,14 +61,14 @@ class Outcome:
         return {row.episode_id: row for row in self.rows}
 
     def content(self, episode_id: str) -> str:
-        """A short name of a rendered episode's content: equal names, equal bytes in a dataset."""
+        """Return a short name of a rendered episode's content: equal names mean equal bytes in a dataset."""
         row = self.row_of[episode_id]
         frames = self.frames[row.trajectory_id]
         return digest(asdict(row), frames.made_by, frames.device, frames.replay_mode)[:16]
 
 
 def shuffled(episode_ids: Iterable[str]) -> list[str]:
-    """In the order in which episodes are written, because readers walk shards in order."""
+    """Sort episode ids into the order in which they are written: shuffled, because readers walk shards in order."""
     return sorted(episode_ids, key=lambda episode_id: digest("order", episode_id))
 
 
@@ -75,33 +78,35 @@ def replayed(
     rejected: Mapping[str, str] | None = None,
     limits: FilterConfig = FilterConfig(),  # noqa: B008 - frozen
 ) -> dict[str, dict[str, Any]]:
-    """Trajectory id to its row in the table of replays.
+    """Map trajectory ids to their rows in the table of replays.
 
     Args:
         rejected: episode id to the reason why its frames were rejected.
 
     Raises:
-        PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
+        PipelineError: when a trajectory that the plan needs is missing, or can no longer be read.
     """
     trajectories = store.rows()
     needed = selection.pending(rows, verdicts_of(trajectories, rows, limits), rejected)
-    # What takes the place of rejected frames, only the stage render replays.
+    # Only the stage `render` replays reserves that replace episodes with rejected frames.
     _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
 
 
 def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[str, str]:
-    """Episode id to the reason why one of its streams was not rendered, where that is so.
+    """Map the ids of episodes with a rejected stream to the reason of the rejection.
 
     Args:
-        frames: trajectory id to what is stored of its frames.
+        frames: trajectory id to the record of its stored frames.
     """
     reasons: dict[str, str] = {}
     for row in rows:
-        if (shown := frames.get(row.trajectory_id)) and shown.rejected:
-            for stream in streams_of(row.perturbations).values():
-                if stream.stream_id in shown.rejected:
-                    reasons[row.episode_id] = shown.rejected[stream.stream_id]
+        stored = frames.get(row.trajectory_id)
+        if stored is None or not stored.rejected:
+            continue
+        for stream in streams_of(row.perturbations).values():
+            if stream.stream_id in stored.rejected:
+                reasons[row.episode_id] = stored.rejected[stream.stream_id]
     return reasons
 
 
@@ -109,32 +114,38 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
     """Judge every row of a plan after the render stage, and apply ``export.where``.
 
     Raises:
-        PipelineError: when a trajectory or a frame that the plan needs is not there, or can no longer be read.
+        PipelineError: when a trajectory or a frame that the plan needs is missing, or can no longer be read.
     """
     stored_frames = shown_of(frames.rows())
     rejected = rejections(rows, stored_frames)
     replays = replayed(rows, trajectories, rejected, config.filter)
     judged = selection.select(rows, verdicts_of(replays, rows, config.filter), rejected)
-    if where := config.export.where:
+    where = config.export.where
+    if where:
         for row in rows:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
                 judged[row.episode_id] = Verdict(False, LEFT_OUT)
     failures = [row for row in missed(rows, judged, config.export) if row.episode_id not in rejected]
     kept = [row for row in rows if judged[row.episode_id].kept]
     not_rendered = [row for row in (*kept, *failures) if not rendered(row, stored_frames)]
-    _refuse_missing([*dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)], "render")
+    folders = dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)
+    _refuse_missing(list(folders), "render")
     return Outcome(rows, replays, stored_frames, judged, [row.episode_id for row in failures])
 
 
 def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
-    """The failures that are asked for, by the verdicts of ``selection.select``."""
-    found = [row for row in rows if export.failures and judged[row.episode_id].reason in MISSED]
+    """List the failures that ``export`` asks for, by the verdicts of ``selection.select``."""
+    if not export.failures:
+        return []
+    failures = [row for row in rows if judged[row.episode_id].reason in MISSED]
     where = export.where
-    return [row for row in found if where is None or where.takes(row.axis, row.component, row.level, row.suite)]
+    if where is None:
+        return failures
+    return [row for row in failures if where.takes(row.axis, row.component, row.level, row.suite)]
 
 
 def rendered(row: plan.Row, frames: Mapping[str, Shown]) -> bool:
-    """Whether the frames that an episode shows are stored."""
+    """Return whether the frames that an episode shows are stored."""
     needed = {stream.stream_id for stream in streams_of(row.perturbations).values()}
     return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams
 
@@ -153,18 +164,20 @@ def outdated(
 ) -> Counter[str]:
     """Count the stored files of a plan that this version, or this machine, would generate again, by reason.
 
-    Counted are finished files of today's plan, with today's settings, that were made with other recipes, packages,
-    machine code or another OpenGL device: see ``identity.refuse_unasked``. A changed configuration or plan wants new
-    files, and nobody is asked.
+    The count includes finished files of today's plan, with today's settings, that were generated with other recipes,
+    packages, machine code or another OpenGL device: see ``identity.refuse_unasked``. Files that a changed
+    configuration or plan replaces are not counted, as they need no permission.
 
     Args:
-        device: what renders here, as OpenGL names it; without it, frames of any device count as finished.
+        device: OpenGL name of the device that renders here; without it, frames of any device count as finished.
     """
     planned = dict.fromkeys(row.trajectory_id for row in rows)
-    found: Counter[str] = Counter()
-    for what, reasons in (
-        ("trajectories", trajectories.outdated(planned)),
-        ("files of frames", frames.outdated_of(planned, device)),
-    ):
-        found.update({f"{what}, made with {reason}": number for reason, number in reasons.items()})
-    return found
+    by_kind = {
+        "trajectories": trajectories.outdated(planned),
+        "files of frames": frames.outdated_of(planned, device),
+    }
+    numbers: Counter[str] = Counter()
+    for kind, reasons in by_kind.items():
+        for reason, number in reasons.items():
+            numbers[f"{kind}, made with {reason}"] += number
+    return numbers

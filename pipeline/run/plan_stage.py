@@ -1,4 +1,4 @@
-"""What the stage ``plan`` does, and how ``status`` and ``doctor`` know the plan that a run would make."""
+"""Work of the stage ``plan``, and the plan that a run would have, for ``status`` and ``doctor``."""
 
 import sys
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ def make(config: Config) -> list[plan.Row]:
     """Plan a run; nothing is written.
 
     Raises:
-        PipelineError: when a chosen task has no demonstration, or an axis nothing to plan from.
+        PipelineError: when a chosen task has no demonstration, or an axis has nothing to sample from.
     """
     index = config.demos.index()
     for problem in index.problems:
@@ -32,7 +32,7 @@ def make(config: Config) -> list[plan.Row]:
 
 
 def write(rows: Sequence[plan.Row], run: Run) -> None:
-    """Write the plan, and remember what it was made from."""
+    """Write the plan, and remember the inputs that it was made from."""
     plan.write(rows, run.plan_file)
     _memory(run).keep()
 
@@ -45,7 +45,7 @@ def is_up_to_date(run: Run) -> bool:
 def upcoming(run: Run) -> Sequence[plan.Row]:
     """Return the plan that a run would have: its own if up to date, else another, made here and not written.
 
-    It is empty where a run has neither a plan nor finished work: then it is not made, which may take a minute.
+    If a run has neither a plan nor finished work, the result is empty, as making a plan may take a minute.
 
     Raises:
         PipelineError: as of ``make``.
@@ -59,8 +59,7 @@ def upcoming(run: Run) -> Sequence[plan.Row]:
 
 def _memory(run: Run) -> Memory:
     config = run.config
-    sections = {
-        name: section for name, section in inputs.settings(config).items() if name in ("demos", "plan", "replay")
-    }
+    settings = inputs.settings(config)
+    sections = {name: settings[name] for name in ("demos", "plan", "replay")}
     made_by = digest(sections, inputs.listing(config), library(), made_with("physics"))
     return Memory(run.folder, "plan", made_by, [PLAN])

@@ -1,4 +1,4 @@
-"""One file of frames as a worker makes it: it reads the trajectory, has it rendered, and stores what was encoded."""
+"""Job of a worker that generates one file of frames: read the trajectory, render it, store the encoded frames."""
 
 import platform
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class RenderJob:
 
     Attributes:
         row: a row of the plan that has this trajectory.
-        device: what renders the run, as OpenGL names it.
+        device: OpenGL name of the device that renders the run.
     """
 
     row: Row
@@ -38,7 +38,7 @@ class RenderJob:
     device: str
 
     def __call__(self) -> None:
-        """Store the streams in one file: those that other files of the trajectory hold are copied, others rendered.
+        """Store the streams in one file: copy the streams that other files of the trajectory hold, render the rest.
 
         Raises:
             PipelineError: when another device renders here: its pixels differ, and the run would never use them.
@@ -55,7 +55,7 @@ class RenderJob:
         parts, missing = self._stored()
         if missing:
             task = find_task(self.row.suite, self.row.task)
-            if trajectory.quality is None:  # Of what missed its goal, only rendering asks for it.
+            if trajectory.quality is None:  # The replay of a failure stores no quality.
                 trajectory = replace(trajectory, quality=measure(trajectory, task))
             parts = [*parts, render(trajectory, task, missing, self.config, scene_of_process())]
         self._save(parts)
@@ -64,13 +64,13 @@ class RenderJob:
         return self.row.demo_steps * len(self.streams)
 
     def limit_s(self) -> float:
-        """So long it may take before it counts as hanging: about twenty times what a frame takes without a GPU."""
+        """Return the time after which the job counts as hanging, in s: about twenty times the time without a GPU."""
         return 1800.0 + 2.0 * self.frames_at_most()
 
     def lost(self) -> None:
-        """Store that no worker survived the streams, unless one stored them before it was lost.
+        """Store that no worker survived the streams, unless a worker stored them before it was lost.
 
-        They are not tried again while the file is there.
+        The streams are not tried again while the file exists.
         """
         trajectory = self._trajectory()
         action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
@@ -83,10 +83,12 @@ class RenderJob:
         return TrajectoryStore(self.trajectories).load(self.row.trajectory_id)
 
     def _stored(self) -> tuple[list[Rendered], list[Stream]]:
-        """What files hold of the streams, and those that none holds."""
+        """Read the streams that files hold, and list the streams that no file holds."""
         wanted = {stream.stream_id: stream.geometry.stream_id for stream in self.streams}
         parts = FrameStore(self.frames, self.config).stored(self.row.trajectory_id, wanted, self.device)
-        held = {stream_id for part in parts for stream_id in (*part.streams, *part.rejected)}
+        held: set[str] = set()
+        for part in parts:
+            held |= {*part.streams, *part.rejected}
         return parts, [stream for stream in self.streams if stream.stream_id not in held]
 
     def _save(self, parts: list[Rendered]) -> None:

@@ -1,4 +1,4 @@
-"""What the stage ``render`` does: the frames that a plan needs and the store lacks are rendered by workers."""
+"""Work of the stage ``render``: workers render the frames that a plan needs and the store lacks."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -21,39 +21,46 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
 STREAMS_OF_A_JOB = 64
-"""Bounds a render job: minutes of a core, which a kill loses at most, and some 200 MB of encoded frames.
+"""Largest number of streams of a render job, which takes minutes of a core and some 200 MB of encoded frames.
 
-A trajectory's second job may have to open its scene once more, which takes some seconds.
+A kill loses at most one job per worker. A trajectory's second job may have to open its scene again, which takes some
+seconds.
 """
 
 Portion = tuple[Row, tuple[Stream, ...]]
-"""A row of the plan, and streams of its trajectory that lie in one file."""
+"""A row of the plan, and streams of its trajectory that are stored in one file."""
 
 
 def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tuple[Stream, ...]]:
-    """The needed streams of a trajectory, in portions of ``STREAMS_OF_A_JOB`` at most, each to be one file.
+    """Cut the needed streams of a trajectory into portions of at most ``STREAMS_OF_A_JOB``, one file each.
 
-    All planned ones are cut, and then those left out that are not needed. So a portion does not change when a stream
-    of another one is rejected and a reserve takes its place. Streams that share a scene are beside each other.
+    All planned streams are cut into portions first; unneeded streams are left out afterwards. A portion therefore does
+    not change if a stream of another portion is rejected and a reserve replaces its episode. Streams that share a scene
+    are next to each other.
 
     Args:
         planned: stream id to each stream that an episode of the plan shows, reserves included.
-        needed: ids of those that are to be rendered.
+        needed: ids of the streams to render.
     """
     ordered = sorted(planned.items(), key=lambda item: (item[1].scene(textures=False), item[1].scene(), item[0]))
-    cut = [int(end) for end in np.linspace(0, len(ordered), math.ceil(len(ordered) / STREAMS_OF_A_JOB) + 1)]
-    wanted = [tuple(stream for name, stream in ordered[a:b] if name in needed) for a, b in pairwise(cut)]
-    return [portion for portion in wanted if portion]
+    number = math.ceil(len(ordered) / STREAMS_OF_A_JOB)
+    cuts = [int(cut) for cut in np.linspace(0, len(ordered), number + 1)]
+    needed_portions = []
+    for start, end in pairwise(cuts):
+        portion = tuple(stream for name, stream in ordered[start:end] if name in needed)
+        if portion:
+            needed_portions.append(portion)
+    return needed_portions
 
 
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, workers: Workers) -> set[str]:
-    """Render the streams of every kept episode, and of failures where asked for, that ``folder`` does not hold yet.
+    """Render the streams that ``folder`` lacks of every kept episode, and of failures if the configuration asks.
 
-    Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing that
-    can be made from the trajectories that are there.
+    Reserves replace episodes with rejected frames. Rendering therefore repeats until it has generated all files that it
+    can from the stored trajectories.
 
     Returns:
-        The files of ``folder`` that the plan needs: the same ones whatever was rendered before.
+        The files of ``folder`` that the plan needs. They do not depend on what was rendered before.
 
     Raises:
         PipelineError: when rendering leaves the same work undone.
@@ -80,10 +87,10 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
         from pipeline.rendering.renderer import scene_of_process
         from pipeline.run.render_job import RenderJob
 
-        # Those of many streams first, so that no worker is left alone with one at the end. Those of few, to which the
-        # scene matters, by task and demonstration: what their scenes have in common, a worker keeps.
-        in_turn = sorted(missing.values(), key=lambda one: (-len(one[1]), one[0].suite, one[0].task, one[0].demo_id))
-        jobs = [RenderJob(*portion, trajectories, folder, config.render, device) for portion in in_turn]
+        jobs = [RenderJob(*portion, trajectories, folder, config.render, device) for portion in missing.values()]
+        # Jobs of many streams come first, so that none of them runs alone at the end. In jobs of few streams the scene
+        # takes most of the time. They are ordered by task and demonstration, as a worker keeps shared parts of scenes.
+        jobs.sort(key=lambda job: (-len(job.streams), job.row.suite, job.row.task, job.row.demo_id))
         work = Expendable(RenderJob.__call__, RenderJob.limit_s, RenderJob.lost, RenderJob.frames_at_most)
         try:
             workers(work, jobs, "render, frames")
@@ -94,7 +101,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
 def _needed(
     rows: Sequence[Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str], failures: Collection[str]
 ) -> dict[str, Portion]:
-    """Name of each file that the plan needs to what is in it, as far as verdicts and rejections are known.
+    """Map the name of each file that the plan needs to its portion, by the verdicts and rejections so far.
 
     Args:
         judged: trajectory id to its verdict.
@@ -106,14 +113,15 @@ def _needed(
     needed: dict[str, set[str]] = {}
     outcome = select(rows, judged, rejected)
     for row in rows:
-        shown = {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
-        planned[row.trajectory_id] |= shown
+        streams = {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+        planned[row.trajectory_id] |= streams
         verdict = outcome[row.episode_id]
         # A rejected stream stays needed: without it, its episode would be tried again.
         if verdict.kept or verdict.reason in (rejected.get(row.episode_id), *failures):
-            needed.setdefault(row.trajectory_id, set()).update(shown)
-    return {
-        file_name(trajectory_id, [stream.stream_id for stream in portion]): (row_of[trajectory_id], portion)
-        for trajectory_id, ids in needed.items()
-        for portion in portions(planned[trajectory_id], ids)
-    }
+            needed.setdefault(row.trajectory_id, set()).update(streams)
+    files: dict[str, Portion] = {}
+    for trajectory_id, stream_ids in needed.items():
+        for portion in portions(planned[trajectory_id], stream_ids):
+            name = file_name(trajectory_id, [stream.stream_id for stream in portion])
+            files[name] = (row_of[trajectory_id], portion)
+    return files

@@ -1,4 +1,4 @@
-"""One replay as a worker does it: read the demonstration, have physics replay and judge it, store the trajectory."""
+"""Job of a worker that makes one replay: read the demonstration, replay and judge it, store the trajectory."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -27,7 +27,7 @@ class ReplayJob:
 
     Attributes:
         row: a row of the plan that has this trajectory.
-        twin: trajectory of the same demonstration without perturbations, which tracking follows.
+        twin: id of the trajectory of the same demonstration without perturbations, which tracking follows.
     """
 
     row: Row
@@ -40,7 +40,7 @@ class ReplayJob:
         """Replay, judge and store; returns the verdict.
 
         Raises:
-            PipelineError: when the demonstration is not there, or another than the plan was drawn for.
+            PipelineError: when the demonstration is missing, or has changed since the plan.
         """
         demo = self.demos.open().load(self.row.demo_id)
         if demo.sha256 != self.row.demo_sha256:
@@ -54,11 +54,13 @@ class ReplayJob:
         environment = shared(demo.task)
         reference = partial(self._reference, environment, demo)
         start, config = demo, self.config
-        if (seed := self.row.reset_seed) is not None:
-            # Sent as they were, the actions would hit by luck and teach that where things stand does not matter.
-            start, config = _at_reset(environment, demo, seed), config.model_copy(update={"mode": "tracked"})
+        seed = self.row.reset_seed
+        if seed is not None:
+            # Open-loop actions would succeed by luck, and teach that object positions do not matter.
+            start = _at_reset(environment, demo, seed)
+            config = config.model_copy(update={"mode": "tracked"})
         trajectory = replay(environment, start, self.row.trajectory_id, config, physics, reference)
-        # Nor do they work against a push.
+        # Open-loop actions do not work against a push either.
         tracks = seed is not None or trajectory.scene.push is not None
         if tracks and trajectory.verdict.kept and trajectory.mode != "tracked":
             trajectory = replace(trajectory, verdict=Verdict(False, "no_reference"))
@@ -68,27 +70,28 @@ class ReplayJob:
         return trajectory.verdict
 
     def _reference(self, environment: Environment, demo: Demo) -> Reference | None:
-        """What tracking follows: the twin where it reached its goal, else the recording."""
+        """Return the reference that tracking follows: the twin if it reached its goal, else the recording."""
         if self.twin != self.row.trajectory_id:
             twin = TrajectoryStore(self.folder).path(self.twin)
-            if (followed := _twin(edition(twin))) is not None:
-                return followed
+            reference = _twin(edition(twin))
+            if reference is not None:
+                return reference
         if demo.states is None:
-            # The way the hand went when it was recorded, before anything settled.
+            # Replay the recorded hand motion, which began before anything settled.
             unsettled = self.config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
             return _followed(replay(environment, demo, self.row.trajectory_id, unsettled))
         mask = kept_actions(demo.actions, self.config.noops)
-        # The state after the last action is not recorded: as if the hand rested.
+        # The state after the last action is not recorded: assume that the hand rests.
         states = np.vstack([demo.states[mask], demo.states[-1:]])
         model_xml = demo.model_xml or environment.place_fixtures(self.config.fixture_seed)
         return Reference.of(model_xml, states, demo.actions[mask])
 
     def limit_s(self) -> float:
-        """So long it may take before it counts as hanging; the longest take about a minute."""
+        """Return the time after which the replay counts as hanging, in s; the longest replays take about a minute."""
         return 1800.0
 
     def lost(self) -> Verdict:
-        """Store that no worker survived this replay, or finished it; it is not tried again while the file is there."""
+        """Store that no worker survived or finished this replay; it is not tried again while the file exists."""
         trajectory = Trajectory(
             trajectory_id=self.row.trajectory_id,
             mode="open_loop",
@@ -103,7 +106,7 @@ class ReplayJob:
 
 
 def _at_reset(environment: Environment, demo: Demo, seed: int) -> Demo:
-    """The demonstration as if recorded from another reset: LIBERO's recordings begin once the gripper has opened."""
+    """Return the demonstration as if recorded from another reset; LIBERO's recordings begin with an open gripper."""
     model_xml = environment.reset(seed)
     environment.settle(LEFT_OUT_STEPS)
     return replace(demo, init_state=environment.state, states=None, model_xml=model_xml)
@@ -111,12 +114,12 @@ def _at_reset(environment: Environment, demo: Demo, seed: int) -> Demo:
 
 @lru_cache(maxsize=1)
 def _twin(file: Edition) -> Reference | None:
-    """What a twin did, if it reached its goal."""
+    """Return the motion of a twin, `None` if it did not reach its goal."""
     return _followed(TrajectoryStore(file.path.parent).load(file.path.stem))
 
 
 def _followed(trajectory: Trajectory) -> Reference | None:
-    """What a replay did, if it reached its goal."""
+    """Return the motion of a replay, `None` if it did not reach its goal."""
     if not trajectory.verdict.kept:
         return None
     return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)

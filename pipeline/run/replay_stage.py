@@ -1,4 +1,4 @@
-"""What the stage ``replay`` does: the trajectories that a plan needs and the store lacks are replayed by workers."""
+"""Work of the stage ``replay``: workers replay the trajectories that a plan needs and the store lacks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,9 +18,12 @@ NO_LIMITS = FilterConfig()
 
 @dataclass(frozen=True)
 class Replays:
-    """How the trajectories of a run are made.
+    """Replays of a run: demonstrations, settings, store and workers.
 
     Attributes:
+        demos: the section ``demos``.
+        config: the section ``replay``.
+        folder: folder of the trajectories.
         limits: the section ``filter``.
     """
 
@@ -31,12 +34,12 @@ class Replays:
     limits: FilterConfig = NO_LIMITS
 
     def of(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
-        """Have what a plan needs in the store; reserves only where a candidate failed.
+        """Replay what a plan needs and the store lacks; replay reserves only if a candidate failed.
 
         The twins come first, because tracking follows them.
 
         Args:
-            rejected: episode id to the reason why its frames were rejected, as far as frames were made.
+            rejected: episode id to the reason why its frames were rejected, as far as frames were rendered.
 
         Returns:
             Trajectory id to verdict, for every trajectory that was needed.
@@ -54,7 +57,8 @@ class Replays:
                 if missing:
                     self._replay(missing, rows)
                     stored = verdicts_of(store.refresh(), rows, self.limits)
-                    _refuse_undone([store.path(one) for one in missing if one not in stored])
+                    undone = [trajectory_id for trajectory_id in missing if trajectory_id not in stored]
+                    _refuse_undone([store.path(trajectory_id) for trajectory_id in undone])
                 verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed}
         return verdicts
 

@@ -43,10 +43,10 @@ AnyFormat = Format[Any]
 
 
 class Run:
-    """One run: its configuration, the paths in its folder, and what is stored there.
+    """One run: its configuration, the paths in its folder, and the stored files.
 
-    Stores, outcome and datasets are opened when they are first asked for, and kept. Plan and manifest are read again
-    when their file has changed. A stage or a command gets a ``Run`` of its own.
+    Stores and outcome are opened at first use, and kept. Plan and manifest are read again when their file has changed.
+    Each stage or command gets its own ``Run``.
     """
 
     def __init__(self, config: Config, folder: Path | None = None) -> None:
@@ -54,11 +54,11 @@ class Run:
         self.folder = folder or config.data
 
     def __reduce__(self) -> tuple[type["Run"], tuple[Config, Path]]:
-        """Send a worker the configuration and the folder alone; it opens what it needs."""
+        """Send only the configuration and the folder to a worker, which opens the stores itself."""
         return Run, (self.config, self.folder)
 
     def resolved(self) -> "Run":
-        """Return the same run with an absolute path, without links, for libraries that change or compare paths."""
+        """Return this run with an absolute path, without links, for libraries that change or compare paths."""
         return Run(self.config, self.folder.resolve())
 
     def path(self, name: str) -> Path:
@@ -116,7 +116,7 @@ class Run:
 
     @cached_property
     def outcome(self) -> Outcome:
-        """Plan and verdicts after the stage ``render``, and what ``export.where`` leaves out.
+        """Plan and verdicts after the stage ``render``, with ``export.where`` applied.
 
         Raises:
             PipelineError: when a trajectory or a frame that the plan needs is missing or cannot be read.
@@ -140,7 +140,7 @@ class Run:
 
     @property
     def recorded_formats(self) -> list[AnyFormat]:
-        """Datasets that the configuration asks for; of failures only those that exist."""
+        """Datasets that the configuration asks for; datasets of failures only if they exist."""
         return recorded(self.folder, self.config.export, self.config.render.extras)
 
     def episodes(self, **options: Any) -> EpisodeLoader:

@@ -1,4 +1,4 @@
-"""The folder of a run: which configuration it belongs to, and the lock that keeps other processes out."""
+"""Folder of a run: its mark, which states the configuration file, and the lock that keeps other processes out."""
 
 import fcntl
 import os
@@ -23,14 +23,14 @@ PLACES = ("name", "folder", "compute")
 """Fields of a configuration that state where a run is stored and computed. A folder that was moved has others."""
 
 PARAMS = Path("params.yaml")
-"""Says which run `dvc repro` makes, and in which folder."""
+"""File that states which run `dvc repro` makes, and in which folder."""
 
 LOCK = ".lock"
 """Empty file of a run's folder that a stage holds while it runs."""
 
 
 class Mark(NamedTuple):
-    """What a run's folder states about its configuration file.
+    """Mark of a run's folder, which states its configuration file.
 
     Attributes:
         file: absolute path of the configuration file.
@@ -73,12 +73,12 @@ def claimed(file: Path) -> Config:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other stages out of a run's folder, and clear what killed ones left in it.
+    """Keep other stages out of a run's folder, and delete what killed stages left in it.
 
-    The system ends the lock with this process, however it ends.
+    The system ends the lock with this process, however the process ends.
 
     Raises:
-        PipelineError: when a stage runs there.
+        PipelineError: when another stage runs in the folder, or the file system has no locks.
     """
     with (folder / LOCK).open("a") as file:
         try:
@@ -90,7 +90,7 @@ def locked(folder: Path) -> Iterator[None]:
                 expected="one stage at a time, as each reads what the one before it has finished",
                 remedy=f"wait for it, or stop it; `{MAKE_AGAIN}` runs all stages in order",
             ) from error
-        except OSError as error:  # Such as Lustre, mounted without them.
+        except OSError as error:  # Lustre, for example, can be mounted without locks.
             raise PipelineError(
                 f"the file system cannot lock a file ({error.strerror})",
                 where=folder,
@@ -114,7 +114,7 @@ def owned(file: Path) -> Run:
 
 
 def refuse_unmarked(folder: Path) -> None:
-    """Reject a folder that holds files and that no configuration has claimed: the files are not of a run.
+    """Reject a folder that holds files and that no configuration has claimed, as the files are not of a run.
 
     Raises:
         PipelineError: naming the folder and some of its files.
@@ -163,18 +163,18 @@ def _refuse_other_owner(config: Config, file: Path) -> None:
     mark = _mark(folder)
     if mark is None or mark.file == file.resolve():
         return
-    this, other = _shown(file.resolve(), mark.file)
+    this, owner = _shown(file.resolve(), mark.file)
     adopt = f'to have the folder belong to {this}, write {{"configuration": "{this}"}} into {folder / OWNER}'
     if mark.file.exists():
         raise PipelineError(
-            f"the folder belongs to {other}, and {this} has the same name: {config.name}",
+            f"the folder belongs to {owner}, and {this} has the same name: {config.name}",
             where=folder,
             expected="a folder for each configuration file, as a run deletes what it did not plan",
             remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
         )
     if mark.content != _content(file):
         raise PipelineError(
-            f"the folder belongs to {other}, which is not there, and {this} has another content",
+            f"the folder belongs to {owner}, which is not there, and {this} has another content",
             where=folder,
             expected="the content of the last run, where a folder or a configuration file was moved",
             remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
@@ -224,7 +224,8 @@ def _content(file: Path) -> str:
 
 
 def _refuse_links(folder: Path) -> None:
-    if links := [entry for entry in folder.iterdir() if entry.is_symlink()]:
+    links = [entry for entry in folder.iterdir() if entry.is_symlink()]
+    if links:
         raise PipelineError(
             "is a symbolic link",
             where=links[0],

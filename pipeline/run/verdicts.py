@@ -1,4 +1,4 @@
-"""Which replays a run keeps: those that succeeded in the simulator and that the section ``filter`` lets pass."""
+"""Verdicts on replays: a run keeps replays that succeed in the simulator and pass the section ``filter``."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,11 +12,12 @@ from pipeline.types import Verdict
 def verdicts_of(
     stored: Mapping[str, Mapping[str, Any]], rows: Sequence[Row], limits: FilterConfig
 ) -> dict[str, Verdict]:
-    """Trajectory id to verdict, for every stored trajectory.
+    """Map the id of every stored trajectory to its verdict.
 
     Args:
         stored: trajectory id to its row in the table of replays.
-        rows: the plan, which tells the suite of each trajectory; of others, the number of steps is not limited.
+        rows: the plan, which has the suite of each trajectory. Steps of trajectories outside the plan are not limited.
+        limits: the section ``filter``.
     """
     suite_of = {row.trajectory_id: row.suite for row in rows}
     return {name: _verdict(replayed, suite_of.get(name), limits) for name, replayed in stored.items()}

@@ -24,17 +24,17 @@ from pipeline.stores.store import SUFFIX, Store
 from pipeline.types import Geometry, Quality, Rendered
 
 _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
-"""The schema's parts that say what files of a store hold."""
+"""Parts of the schema that describe the content of a store's files."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What is stored of one trajectory's frames, in all its files.
+    """Record of one trajectory's stored frames, in all its files.
 
     Attributes:
-        made_by, device, replay_mode: as in the table.
-        streams: ids of those that were rendered.
-        rejected: stream id to the reason why it was not.
+        made_by, device, replay_mode: values of the table's columns.
+        streams: ids of the rendered streams.
+        rejected: id of each rejected stream to the reason.
     """
 
     made_by: str
@@ -47,11 +47,11 @@ class Shown:
 class FrameStore(Store):
     """Frames under one folder.
 
-    The columns of its table are ``device`` (what rendered, as OpenGL names it), ``replay_mode``, ``steps``, ``streams``
-    (ids of those that were rendered) and ``rejected`` (JSON, stream id to the reason why it was not). A file's name is
-    ``<trajectory id>/<digest of its streams>``.
+    The columns of its table are ``device`` (OpenGL name of the device that rendered), ``replay_mode``, ``steps``,
+    ``streams`` (ids of the rendered streams) and ``rejected`` (JSON, id of each rejected stream to the reason). A
+    file's name is ``<trajectory id>/<digest of its streams>``.
 
-    What was encoded otherwise than ``config`` says counts as missing.
+    Frames that were encoded with another ``config`` count as missing.
     """
 
     step, stage, pattern = "encoding", "render", f"*/*{SUFFIX}"
@@ -64,20 +64,24 @@ class FrameStore(Store):
     }
 
     def __init__(self, root: Path, config: RenderConfig):
-        shown = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
+        schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
         maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*config.extras} else {}
-        super().__init__(root, config.model_dump(mode="json"), {"episode schema": shown, **maps})
+        super().__init__(root, config.model_dump(mode="json"), {"episode schema": schema, **maps})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
-        told = {name: file.attributes[name] for name in ("device", "replay_mode", "rejected")}
-        return {**told, "steps": len(file.array("action")), "streams": _members(file, "streams")}
+        attributes = {name: file.attributes[name] for name in ("device", "replay_mode", "rejected")}
+        return {**attributes, "steps": len(file.array("action")), "streams": _members(file, "streams")}
 
     def folder(self, trajectory_id: str) -> Path:
         return self.root / trajectory_id
 
     def save(self, trajectory_id: str, rendered: Rendered, device: str) -> None:
-        """Store what ``device``, as OpenGL names it, rendered of a trajectory, in a file of its own."""
+        """Store rendered streams of a trajectory in their own file.
+
+        Args:
+            device: OpenGL name of the device that rendered them.
+        """
         attributes = {
             "device": device,
             "replay_mode": rendered.replay_mode,
@@ -105,11 +109,11 @@ class FrameStore(Store):
         """Read the named streams of a trajectory.
 
         Args:
-            streams: ids of streams, one at least.
+            streams: ids of at least one stream.
             geometry: ids of the geometry to read with them.
 
         Raises:
-            PipelineError: when a file is damaged, or one of the streams or its geometry is not there.
+            PipelineError: when a file is damaged, or a stream or its geometry is missing.
         """
         frames, views = set(streams), set(geometry)
         parts: list[Rendered] = []
@@ -117,10 +121,11 @@ class FrameStore(Store):
             if not frames and not views:
                 break
             with self.opened(name) as file:
-                here = frames & {*_members(file, "streams")}, views & {*_members(file, "geometry")}
-                if any(here):
-                    parts.append(_rendered(file, *here))
-            frames, views = frames - here[0], views - here[1]
+                frames_of_file = frames & {*_members(file, "streams")}
+                views_of_file = views & {*_members(file, "geometry")}
+                if frames_of_file or views_of_file:
+                    parts.append(_rendered(file, frames_of_file, views_of_file))
+            frames, views = frames - frames_of_file, views - views_of_file
         if frames or views or not parts:
             raise PipelineError(
                 f"streams {sorted(frames | views)} were not rendered",
@@ -165,10 +170,10 @@ class FrameStore(Store):
         return reasons
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Action (K, 7) and state (K, 8) of a trajectory, without its frames.
+        """Read action (K, 7) and state (K, 8) of a trajectory, without its frames.
 
         Raises:
-            PipelineError: when a file is damaged, or none is there.
+            PipelineError: when a file is damaged, or no file has frames.
         """
         for name in self._files_of(trajectory_id):
             with self.opened(name) as file:
@@ -181,37 +186,42 @@ class FrameStore(Store):
 
 
 def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
-    """Of the file that holds these streams of a trajectory, or says that they were rejected."""
+    """Return the name of the file that holds these streams of a trajectory, or states that they were rejected."""
     return f"{trajectory_id}/{digest(*sorted(streams))[:16]}"
 
 
 def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
-    """Trajectory id to what its files hold, from their rows of the table."""
-    shown: dict[str, Shown] = {}
+    """Map trajectory ids to the records of their stored frames, from the rows of the table."""
+    stored: dict[str, Shown] = {}
     for name, row in rows.items():
-        same = Shown(row["made_by"], row["device"], row["replay_mode"])
-        one = shown.setdefault(name.split("/")[0], same)
-        one.streams.update(row["streams"])
-        one.rejected.update(json.loads(row["rejected"]))
-    return shown
+        trajectory_id = name.split("/")[0]
+        if trajectory_id not in stored:
+            stored[trajectory_id] = Shown(row["made_by"], row["device"], row["replay_mode"])
+        stored[trajectory_id].streams.update(row["streams"])
+        stored[trajectory_id].rejected.update(json.loads(row["rejected"]))
+    return stored
 
 
 def merged(parts: Sequence[Rendered]) -> Rendered:
-    """Streams of one trajectory that were rendered or stored apart; one part at least.
+    """Join streams of one trajectory that were rendered or stored in at least one part.
 
-    What all streams share comes from a part that was rendered, where there is one: who stored that a worker was lost
-    had no states to store.
+    The values that all streams share come from a part with rendered streams, if there is one: a part that only states
+    that a worker was lost has no states.
     """
-    return replace(
-        next((part for part in parts if part.streams), parts[0]),
-        streams={name: frames for part in parts for name, frames in part.streams.items()},
-        rejected={name: why for part in parts for name, why in part.rejected.items()},
-        geometry={name: view for part in parts for name, view in part.geometry.items()},
-    )
+    shared = next((part for part in parts if part.streams), parts[0])
+    streams: dict[str, Sequence[bytes]] = {}
+    rejected: dict[str, str] = {}
+    geometry: dict[str, Geometry] = {}
+    for part in parts:
+        streams.update(part.streams)
+        rejected.update(part.rejected)
+        geometry.update(part.geometry)
+    return replace(shared, streams=streams, rejected=rejected, geometry=geometry)
 
 
 def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[str]) -> Rendered:
-    """What a file holds, of streams and geometry the named ones alone."""
+    """Read the named streams and geometry of a file, and all other values that it holds."""
+    quality = file.attributes["quality"]
     return Rendered(
         replay_mode=file.attributes["replay_mode"],
         state=file.array("state"),
@@ -222,7 +232,7 @@ def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[s
         geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
         object_poses=file.array("object_poses") if "object_poses" in file.checksums else None,
         instances=file.attributes["instances"],
-        quality=Quality(**quality) if (quality := file.attributes["quality"]) else None,
+        quality=Quality(**quality) if quality else None,
     )
 
 
@@ -232,7 +242,7 @@ def _members(file: SealedFile, parent: str) -> list[str]:
 
 
 def _packed(parent: str, files: Sequence[bytes]) -> dict[str, NDArray[Any]]:
-    """Join encoded images into one array of bytes and one of the offsets at which they end."""
+    """Join encoded images into an array of bytes and an array of the offsets at which the images end."""
     ends = np.cumsum([len(content) for content in files], dtype=np.int64)
     return {f"{parent}/bytes": np.frombuffer(b"".join(files), np.uint8), f"{parent}/ends": ends}
 

@@ -35,7 +35,7 @@ def _damage_as_one_error() -> Iterator[None]:
 
 
 class SealedFile:
-    """An open store file; every method raises ``BrokenSealError`` when it is damaged."""
+    """An open store file; every method raises ``BrokenSealError`` when the file is damaged."""
 
     @_damage_as_one_error()
     def __init__(self, archive: ZipFile):
@@ -68,7 +68,7 @@ def unsealed(path: Path) -> Iterator[SealedFile]:
 
 
 def seal(path: Path, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
-    """Write a file of arrays by name and of attributes that JSON can hold; a ``/`` in a name groups arrays."""
+    """Write a file of named arrays and JSON-serialisable attributes; a ``/`` in a name groups arrays."""
     checksums = {}
     with ZipFile(path, "w") as archive:
         for name, values in arrays.items():

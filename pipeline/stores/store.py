@@ -37,23 +37,25 @@ EARLIER_SUFFIX = ".h5"
 """Suffix of the HDF5 files of version 0.3 and earlier, which this version does not read."""
 
 _MADE_WITH = b"made_with"
-"""The table's metadata that has, as JSON, a fingerprint to what files of it were made with."""
+"""Key of the table's metadata: JSON of each fingerprint to the recipes, packages and settings of its files."""
 
 
 class Store(ABC):
-    """The files of one stage.
+    """Files of one stage.
 
     Args:
-        settings: JSON-serialisable, those of the user that the bytes depend on; files with others count as missing.
-        form: what else of this project they depend on, by its name for people.
+        root: folder of the files.
+        settings: JSON-serialisable settings of the user that the bytes depend on. Files with other settings count as
+            missing.
+        form: other parts of this project that the bytes depend on, by their names for people.
     """
 
     step: ClassVar[Step]
-    """What makes the files, in ``pipeline/identity.py``."""
+    """Step of ``pipeline/identity.py`` that generates the files."""
     stage: ClassVar[str]
-    """Which stage makes them anew, for messages."""
+    """Stage that generates the files again, for messages."""
     columns: ClassVar[Mapping[str, pa.DataType]]
-    """Of the table, beside ``file``, ``made_by`` and ``bytes``."""
+    """Columns of the table in addition to ``file``, ``made_by`` and ``bytes``."""
     pattern: ClassVar[str] = f"*{SUFFIX}"
     """Glob pattern of the files below ``root``."""
 
@@ -69,10 +71,10 @@ class Store(ABC):
     @staticmethod
     @abstractmethod
     def describe(file: SealedFile) -> dict[str, Any]:
-        """A file's values of ``columns``."""
+        """Return a file's values of ``columns``."""
 
     def path(self, name: str) -> Path:
-        """Path of a file; its name may contain folders, and has no suffix."""
+        """Return the path of a file; its name may contain folders, and has no suffix."""
         return self.root / f"{name}{SUFFIX}"
 
     def names(self) -> list[str]:
@@ -80,9 +82,10 @@ class Store(ABC):
         return sorted(path.relative_to(self.root).with_suffix("").as_posix() for path in self.root.glob(self.pattern))
 
     def names_of_all_versions(self) -> list[str]:
-        """List all files, also those that this version does not read."""
+        """List all files, also files that this version does not read."""
         earlier = self.root.glob(self.pattern.replace(SUFFIX, EARLIER_SUFFIX))
-        return sorted({*self.names(), *(path.relative_to(self.root).with_suffix("").as_posix() for path in earlier)})
+        earlier_names = {path.relative_to(self.root).with_suffix("").as_posix() for path in earlier}
+        return sorted({*self.names(), *earlier_names})
 
     def write(self, name: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
         """Write a file of arrays, with ``attributes`` as JSON; it is complete or absent."""
@@ -94,7 +97,7 @@ class Store(ABC):
         """Open a file for reading.
 
         Raises:
-            PipelineError: when it is missing, damaged, or not up to date.
+            PipelineError: when the file is missing, damaged, or not up to date.
             OSError: when the system does not open or read it.
         """
         with self._readable(name) as file:
@@ -128,34 +131,34 @@ class Store(ABC):
 
         Raises:
             PipelineError: when a file is damaged.
-            OSError: when the system does not open or read one.
+            OSError: when the system does not open or read a file.
         """
         return self._rows()[0]
 
     def _rows(self) -> tuple[dict[str, dict[str, Any]], bool]:
-        """The rows, and whether the table on disk is these rows and is believed in every one."""
-        believed, doubted = self._believed()
-        read = {name: self.row(name) for name in doubted}
-        rows = {name: row for name, row in (believed | read).items() if row and row["made_by"] == self.made_by}
-        return dict(sorted(rows.items())), not doubted and len(rows) == len(believed)
+        """Return the rows, and True if the table on disk has exactly these rows and all of them are valid."""
+        valid, invalid_names = self._believed()
+        candidates = valid | {name: self.row(name) for name in invalid_names}
+        rows = {name: row for name, row in candidates.items() if row and row["made_by"] == self.made_by}
+        return dict(sorted(rows.items())), not invalid_names and len(rows) == len(valid)
 
     def _believed(self) -> tuple[dict[str, dict[str, Any]], set[str]]:
-        """The table's rows of files that have not changed since, and the names of all other files, also of those gone.
+        """Return the table's valid rows, of any fingerprint, and the names of all other files, deleted files included.
 
-        The rows are whatever fingerprint they have.
+        A row is valid if its file has not changed since the table was written.
         """
-        told, written_ns = self._table()
-        believed = {}
-        for name in self.names():
+        listed, written_ns = self._table()
+        valid = {}
+        names = self.names()
+        for name in names:
             status = self.path(name).stat()
-            if name in told and told[name]["bytes"] == status.st_size and status.st_mtime_ns < written_ns:
-                believed[name] = told[name]
-            else:
-                told.setdefault(name, {})
-        return believed, told.keys() - believed.keys()
+            row = listed.get(name)
+            if row is not None and row["bytes"] == status.st_size and status.st_mtime_ns < written_ns:
+                valid[name] = row
+        return valid, {*listed, *names} - valid.keys()
 
     def rows_of_all_settings(self) -> dict[str, dict[str, Any]]:
-        """Map the name of each file that ``rows`` or the table lists to its row, also files with other settings.
+        """Map the name of each file that ``rows`` or the table lists to its row, also for files with other settings.
 
         Raises:
             PipelineError: as ``rows``.
@@ -164,11 +167,11 @@ class Store(ABC):
         return {name: row for name, row in listed.items() if self.path(name).exists()} | self.rows()
 
     def settings_by_fingerprint(self) -> dict[str, object]:
-        """Map each fingerprint that the table knows to the settings that its files were written with."""
+        """Map each fingerprint of the table's metadata to the settings that its files were written with."""
         return {made_by: made_with["settings"] for made_by, made_with in self._known().items()}
 
     def row(self, name: str) -> dict[str, Any] | None:
-        """Read one row from its file; ``None`` when the file is missing or not up to date.
+        """Read one row from its file; `None` if the file is missing or not up to date.
 
         Raises:
             PipelineError: when the file is damaged.
@@ -183,7 +186,7 @@ class Store(ABC):
         return {"file": name, "made_by": self.made_by, "bytes": self.path(name).stat().st_size, **described}
 
     def _table(self) -> tuple[dict[str, dict[str, Any]], int]:
-        """The rows that were written last, and when; none when the table is missing or damaged."""
+        """Read the table's rows and the time when it was written, in ns; no rows if it is missing or damaged."""
         path = self.root / TABLE
         try:
             table = read_table(path, self._schema.names, "")
@@ -192,24 +195,24 @@ class Store(ABC):
             return {}, 0
 
     def untouched(self) -> bool:
-        """Whether the table tells of every file that is there, and none has changed since."""
+        """Return whether the table lists every stored file, and no file has changed since."""
         return self._rows()[1]
 
     def notice_changes(self) -> None:
-        """Where files are gone or have changed since the table was written, have it tell so."""
+        """Update the table if files were deleted or changed since it was written."""
         if (self.root / TABLE).exists() and self._believed()[1]:
             self.refresh()
 
     def refresh(self) -> dict[str, dict[str, Any]]:
-        """``rows``, written as the table; only for the stage that makes the files."""
-        rows, written = self._rows()
-        known = self._known()
-        if not written or self.made_by not in known:
-            self._write(rows, known | {self.made_by: self._made_with})
+        """Return ``rows`` and write them as the table; only for the stage that generates the files."""
+        rows, table_up_to_date = self._rows()
+        made_with_of = self._known()
+        if not table_up_to_date or self.made_by not in made_with_of:
+            self._write(rows, made_with_of | {self.made_by: self._made_with})
         return rows
 
     def keep(self, names: Iterable[str]) -> None:
-        """Delete every other file of the store and what a killed worker left; write the table again."""
+        """Delete every other file of the store and the leftovers of killed workers; write the table again."""
 
         def made(file: Path) -> bool:
             return file.suffix in (SUFFIX, EARLIER_SUFFIX)
@@ -219,18 +222,19 @@ class Store(ABC):
         if self._known().keys() - {self.made_by} and len(rows) == len(self.names()):
             self._write(rows, {self.made_by: self._made_with})
 
-    def _write(self, rows: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]) -> None:
+    def _write(self, rows: Mapping[str, Mapping[str, Any]], made_with_of: Mapping[str, Any]) -> None:
         listed = [row for _, row in sorted(rows.items())]
-        schema = self._schema.with_metadata({_MADE_WITH: json.dumps(known, sort_keys=True)})
+        schema = self._schema.with_metadata({_MADE_WITH: json.dumps(made_with_of, sort_keys=True)})
         write_table(pa.Table.from_pylist(listed, schema=schema), self.root / TABLE)
 
     def _known(self) -> dict[str, dict[str, Any]]:
-        """Fingerprint to what files with it were made with, as far as the table says so."""
+        """Map the fingerprints in the table's metadata to the recipes, packages and settings of their files."""
         try:
-            known: dict[str, dict[str, Any]] = json.loads(pq.read_schema(self.root / TABLE).metadata[_MADE_WITH])
+            metadata = pq.read_schema(self.root / TABLE).metadata
+            made_with_of: dict[str, dict[str, Any]] = json.loads(metadata[_MADE_WITH])
         except (OSError, pa.ArrowException, LookupError, TypeError, ValueError):
             return {}
-        return known
+        return made_with_of
 
     def outdated(self, names: Iterable[str]) -> Counter[str]:
         """Count, by reason, the finished files that count as missing.
@@ -240,17 +244,17 @@ class Store(ABC):
         Raises:
             PipelineError: when a file is damaged.
         """
-        current, known = self.rows(), self._known()
+        up_to_date, made_with_of = self.rows(), self._known()
         reasons: Counter[str] = Counter()
         for name in names:
-            if name in current:
+            if name in up_to_date:
                 continue
             if not self.path(name).exists():
                 if self.path(name).with_suffix(EARLIER_SUFFIX).exists():
                     reasons["the HDF5 container of an earlier version"] += 1
                 continue
             with self._readable(name) as file:
-                then = known.get(str(file.attributes["made_by"]))
+                then = made_with_of.get(str(file.attributes["made_by"]))
             if then is None:
                 reasons["something that was not written down"] += 1
             elif then["settings"] == self._made_with["settings"]:

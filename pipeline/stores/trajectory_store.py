@@ -18,11 +18,12 @@ from pipeline.types import Push, Quality, Scene, Trajectory, Verdict
 class TrajectoryStore(Store):
     """Trajectories under one folder.
 
-    The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (how the actions came about), ``steps``
-    (how many were executed), ``resolved`` (JSON of what physics perturbations did in the scene), and those of
-    ``Quality``.
+    The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (origin of the actions), ``steps``
+    (number of executed actions), ``resolved`` (JSON of the effects of physics perturbations in the scene), and the
+    columns of ``Quality``.
 
-    A file holds no path of the machine, so that it is the same, and can be read, wherever the packages are installed.
+    A file holds no path of the machine. Its bytes therefore do not depend on where the packages are installed, and
+    every machine can read it.
     """
 
     step, stage = "physics", "render"
@@ -37,8 +38,8 @@ class TrajectoryStore(Store):
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
-        told = {name: file.attributes[name] for name in ("kept", "reason", "mode", "resolved")}
-        return {**told, "steps": len(file.array("actions")), **(file.attributes["quality"] or {})}
+        attributes = {name: file.attributes[name] for name in ("kept", "reason", "mode", "resolved")}
+        return {**attributes, "steps": len(file.array("actions")), **(file.attributes["quality"] or {})}
 
     def save(self, trajectory: Trajectory) -> None:
         scene = trajectory.scene
@@ -49,7 +50,7 @@ class TrajectoryStore(Store):
             "quality": asdict(trajectory.quality) if trajectory.quality else None,
             "gripper": scene.gripper,
             "posture_rad": scene.posture_rad,
-            # Others' files stay what they were before there were pushes.
+            # Files without a push keep the bytes of versions that had no pushes.
             **({} if scene.push is None else {"push": scene.push}),
         }
         arrays: dict[str, NDArray[Any]] = {
@@ -62,27 +63,28 @@ class TrajectoryStore(Store):
         self.write(trajectory.trajectory_id, arrays, attributes)
 
     def load(self, trajectory_id: str) -> Trajectory:
-        """Read a trajectory back.
+        """Read a trajectory.
 
         Raises:
-            PipelineError: when its file is missing, damaged or not current, or what its scene is made of is not here.
+            PipelineError: when its file is missing, damaged or not up to date, or this machine lacks files of its
+                scene.
         """
         with self.opened(trajectory_id) as file:
-            told = file.attributes
-            posture_rad, push, quality = told["posture_rad"], told.get("push"), told["quality"]
+            attributes = file.attributes
+            posture_rad, push, quality = attributes["posture_rad"], attributes.get("push"), attributes["quality"]
             scene = Scene(
                 model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
                 state=file.array("start"),
-                resolved=json.loads(told["resolved"]),
-                gripper=told["gripper"],
+                resolved=json.loads(attributes["resolved"]),
+                gripper=attributes["gripper"],
                 posture_rad=None if posture_rad is None else tuple(posture_rad),
                 push=None if push is None else Push(push[0], tuple(push[1]), *push[2:]),
             )
             return Trajectory(
                 trajectory_id,
-                told["mode"],
+                attributes["mode"],
                 scene,
                 **{name: file.array(name) for name in ("states", "actions", "site_alpha")},
-                verdict=Verdict(told["kept"], told["reason"]),
+                verdict=Verdict(attributes["kept"], attributes["reason"]),
                 quality=None if quality is None else Quality(**quality),
             )
