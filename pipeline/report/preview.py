@@ -141,7 +141,7 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
 
 
 def configured(name: str, config: Config) -> Axis:
-    """Return the axis with the ranges of the configuration, or with its default ranges if the configuration has none."""
+    """Return the axis with the ranges of the configuration, or else with its default ranges."""
     return config.plan.axes.drawn().get(name) or AXES[name]()
 
 
@@ -164,7 +164,7 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
     count = PHYSICS_VARIANTS if of_layer(left, PhysicsPerturbation) else VARIANTS
 
     def wish(candidate: Perturbation) -> tuple[int, int, int]:
-        """Rank a candidate: smallest for a rare component, then a level far from the chosen levels, then a rare level."""
+        """Rank a candidate: first rare components, then levels far from the chosen levels, then rare levels."""
         levels = [p.level for p in chosen if p.component == candidate.component]
         apart = min((abs(level - candidate.level) for level in levels), default=0)
         return len(levels), -apart, sum(p.level == candidate.level for p in chosen)

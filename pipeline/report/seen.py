@@ -101,7 +101,7 @@ class Measure(NamedTuple):
 
 
 class Look(NamedTuple):
-    """A state: the hand in the world's frame, the gap of its fingers, its speed, and the speed of the fastest object."""
+    """A state: the hand in the world's frame, the gap of its fingers, its speed, and the fastest object's speed."""
 
     position_m: Floats
     rotation: Rotation

@@ -29,7 +29,7 @@ LONGEST_CAPTION = 10
 PAIR_SIDE_PX = 192
 HEADER = "in each pair: the clean twin on the left, the perturbed episode on the right"
 MOMENT = 0.35
-"""Share of the episode after which it is shown: the arm is in view, and the objects have not been moved together yet."""
+"""Share of the episode after which it is shown: the arm is in view, and the objects are not moved together yet."""
 
 SPREAD = ("component", "suite", "level", "task")
 """Columns over which the episodes of a sheet are spread, the most important first."""
