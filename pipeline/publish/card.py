@@ -112,8 +112,8 @@ def render(
         reports: contents of the files of ``REPORTS``.
         clients: the section of that name in ``finetune.yaml``, which states how each policy's code is called.
         sheets: the axes that have a picture.
-        name: of the dataset.
-        source: of the demonstrations, ``starter`` or ``hdf5``.
+        name: name of the dataset.
+        source: source of the demonstrations, ``starter`` or ``hdf5``.
         episodes: ``plan.episodes``, empty if the manifest does not have it.
         publish: the publisher's statements.
     """
@@ -124,7 +124,7 @@ def render(
     own_suites = [suite for suite in kept_suites if suite not in SUITES]
     own_rewrites = _own_rewrites(kept)
     libero = own_suites != kept_suites
-    free = all(FREE.match(one.licence) for one in owed) and not (own_suites or own_rewrites)
+    free = all(FREE.match(credit.licence) for credit in owed) and not (own_suites or own_rewrites)
     axes = _axes(kept, shown)
     demos = {row["demo_id"] for row in kept}
     of_task = Counter(demo.rpartition("/")[0] for demo in demos)

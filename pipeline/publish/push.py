@@ -41,7 +41,7 @@ class Upload:
 
     Attributes:
         run: name of the run.
-        format: of the dataset.
+        format: name of the dataset's format.
         dataset: path in the repository to local file, for the files of the dataset.
         others: path in the repository to local file, for all other files.
         sha256: path in the repository to the recorded checksum.

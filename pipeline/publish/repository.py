@@ -28,7 +28,7 @@ class Content(Frozen):
     """Two checksums of a file: the hub states ``sha256`` for large files and ``blob`` for small files.
 
     Attributes:
-        sha256: of the content.
+        sha256: SHA-256 of the content.
         blob: SHA-1 by which git names the content, as ``git hash-object`` prints it.
     """
 
@@ -45,7 +45,7 @@ class LastUpload(Frozen):
 
     Attributes:
         run: name of the run.
-        format: of the dataset.
+        format: name of the dataset's format.
         files: path in the repository to content, of all other uploaded files.
     """
 

@@ -149,7 +149,7 @@ def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, An
         policies: name to episodes on test tasks.
 
     Returns:
-        ``source``: of the published rows.
+        ``source``: reference of the published rows.
         ``tasks``: column to the number of test tasks in it.
         ``shared``: the columns that every evaluated policy was measured on.
         ``evaluated``: rows with ``name``, ``cells``, which map each measured column to an ``Estimate``, ``total`` over

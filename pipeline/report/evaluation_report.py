@@ -98,7 +98,7 @@ def _differ(found: Mapping[str, Any]) -> bool:
 
 
 def _points(tasks: Mapping[str, int]) -> tuple[float, float]:
-    """Return the largest widths of the published rates' intervals, in points: of the total, of the smallest column."""
+    """Return the largest widths, in points, of published rates' intervals: total, and smallest column."""
 
     def widest(count: int) -> float:
         low, high = wilson(count / 2, count)

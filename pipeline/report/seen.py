@@ -277,7 +277,7 @@ def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, f
 
 
 def to_nearest_test(test: TestSet) -> Iterator[tuple[str, float]]:
-    """Measure how close pose tests are to each other: to the nearest place in another test of the same task."""
+    """Measure the distances of pose tests to the nearest place in another test of the same task."""
     moved = (((task.suite, task.base), (task.name, displacements(task.parameters))) for task in test.of("pose"))
     return _to_nearest(test, grouped(moved))
 

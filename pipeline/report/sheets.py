@@ -49,8 +49,8 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
     Args:
         folder: folder of the pictures, one ``<axis>.png`` for each axis with a kept episode that has a twin to show.
     """
-    shown = twins(manifest)
-    perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed" and row["twin_id"] in shown]
+    twin_ids = twins(manifest).keys()
+    perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed" and row["twin_id"] in twin_ids]
     with replaced(folder) as temporary:
         temporary.mkdir()
         for axis, rows in by_axis(perturbed).items():

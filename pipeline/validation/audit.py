@@ -208,7 +208,7 @@ def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def _row(episode: Found, task: Task | None, test: TestSet) -> Compared:
-    """Describe an episode in the axes' parameters: as it shows them, or else by its labels."""
+    """Describe an episode in the axes' parameters, as far as it shows them, or else by its labels."""
     perturbations = [p for p in _labels(episode) if task is not None or not _needs_task(p)]
     if episode.extrinsics is not None:
         perturbations = [p for p in perturbations if p.axis != "camera"]

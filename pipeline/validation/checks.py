@@ -49,8 +49,8 @@ def _chroma(frame: Frame) -> NDArray[np.float64]:
 
 def _colours_off(frame: Frame, stored: Frame) -> float:
     """Return the mean difference of Cb and Cr, as a share of the stored frame's mean distance from grey."""
-    found, wanted = _chroma(frame), _chroma(stored)
-    return float(np.abs(found - wanted).mean() / max(np.abs(wanted).mean(), PALE_LEVELS))
+    chroma, expected = _chroma(frame), _chroma(stored)
+    return float(np.abs(chroma - expected).mean() / max(np.abs(expected).mean(), PALE_LEVELS))
 
 
 def length(case: Case) -> Iterator[Fault]:
@@ -77,13 +77,13 @@ def motion(case: Case) -> Iterator[Fault]:
     for copy in case.copies:
         # Copies of another length cannot be compared; ``length`` reports them.
         for name in MOTION if len(copy) == len(case.made) else ():
-            found, made = getattr(copy.episode, name), getattr(case.made, name)
-            if (found.shape, found.dtype) != (made.shape, made.dtype):
-                what, expected = f"{found.shape} of {found.dtype}", f"{made.shape} of {made.dtype}"
+            values, made = getattr(copy.episode, name), getattr(case.made, name)
+            if (values.shape, values.dtype) != (made.shape, made.dtype):
+                what, expected = f"{values.shape} of {values.dtype}", f"{made.shape} of {made.dtype}"
                 yield case.finding(copy.dataset, f"{name} is {what}", expected)
-            elif not _same(found, made):
-                step = next(t for t in range(len(made)) if not _same(found[t], made[t]))
-                what = f"{name} of step {step} is {found[step].tolist()}"
+            elif not _same(values, made):
+                step = next(t for t in range(len(made)) if not _same(values[t], made[t]))
+                what = f"{name} of step {step} is {values[step].tolist()}"
                 yield case.finding(copy.dataset, what, made[step].tolist())
 
 
@@ -137,9 +137,9 @@ def provenance(case: Case) -> Iterator[Fault]:
     """
     for copy in case.copies:
         for column in case.made.provenance:
-            found, expected = copy.episode.provenance.get(column), case.row[column]
-            if found != expected and column != OWN_VERSION:
-                yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
+            value, expected = copy.episode.provenance.get(column), case.row[column]
+            if value != expected and column != OWN_VERSION:
+                yield case.finding(copy.dataset, f"{column} is {value!r}", repr(expected))
 
 
 def place(case: Case) -> Iterator[Fault]:
@@ -166,9 +166,9 @@ def geometry(case: Case) -> Iterator[Fault]:
     for copy in case.whole:
         for view, made in case.made.geometry.items():
             for name in MATRICES:
-                found, expected = getattr(copy.episode.geometry[view], name), getattr(made, name)
-                if found.dtype != expected.dtype or not np.array_equal(found, expected):
-                    yield case.finding(copy.dataset, f"{view}_{name} is {found.tolist()}", expected.tolist())
+                matrix, expected = getattr(copy.episode.geometry[view], name), getattr(made, name)
+                if matrix.dtype != expected.dtype or not np.array_equal(matrix, expected):
+                    yield case.finding(copy.dataset, f"{view}_{name} is {matrix.tolist()}", expected.tolist())
             for name, files in made.maps.items():
                 if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
@@ -197,9 +197,9 @@ def cameras(case: Case) -> Iterator[Fault]:
     """Check that no view shows the picture of another camera."""
     for seen in case.seen:
         for step, frame in seen.grey.items():
-            for other in case.stored.keys() - {seen.view}:
-                if cv2.PSNR(frame, case.stored[other].grey[step]) > VIDEO_PSNR_DB:
-                    yield case.finding(seen.dataset, f"{seen.view} of step {step} shows {other}", "its own camera")
+            for view in case.stored.keys() - {seen.view}:
+                if cv2.PSNR(frame, case.stored[view].grey[step]) > VIDEO_PSNR_DB:
+                    yield case.finding(seen.dataset, f"{seen.view} of step {step} shows {view}", "its own camera")
 
 
 def alive(case: Case) -> Iterator[Fault]:
@@ -254,7 +254,7 @@ def clock(case: Case) -> Iterator[Fault]:
 
 
 def statistics(case: Case) -> Iterator[Fault]:
-    """Check the statistics of each episode: those of its numbers computed again, those of its views by the frames."""
+    """Compare each episode's statistics with its numbers, and those of its views with the stored frames."""
     for copy in case.whole:
         statistics = copy.statistics
         if statistics is None:

@@ -58,28 +58,28 @@ def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayC
     files = [root / name for name in sorted(glob("**/*.hdf5", root_dir=root, recursive=True))]
     if not files:
         raise PipelineError("there is no HDF5 file", where=root, expected=LAYOUT)
-    found, jobs = Found(len(files)), []
+    result, jobs = Found(len(files)), []
     for file in files:
         try:
             task = _task_of(file, root)
             reject_test_tasks([task])
             jobs.append(_FileJob(root, task, replays, replay))
         except PipelineError as error:
-            found.faults.append(str(error))
+            result.faults.append(str(error))
     work = Expendable(_FileJob.__call__, _FileJob.limit_s, _FileJob.lost)
     first_with: dict[str, DemoEntry] = {}
     for entries, of_file in run(work, jobs, "files"):
-        found.demonstrations += len(entries)
-        found.replayed += of_file.replayed
-        found.faults += of_file.faults
-        found.missed += of_file.missed
-        found.notes += of_file.notes
+        result.demonstrations += len(entries)
+        result.replayed += of_file.replayed
+        result.faults += of_file.faults
+        result.missed += of_file.missed
+        result.notes += of_file.notes
         for entry in entries:
             first = first_with.setdefault(entry.sha256, entry)
             if first.demo_id != entry.demo_id:
                 remedy = "leave the task of one of the two out of demos.tasks"
-                found.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: {remedy}")
-    return found
+                result.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: {remedy}")
+    return result
 
 
 def _task_of(file: Path, root: Path) -> Task:

@@ -105,8 +105,8 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     equally long in every arena.
 
     Args:
-        config: of the run.
-        speed: of the machine.
+        config: configuration of the run.
+        speed: measured speed of the machine.
     """
     tasks = lengths(config.demos)
     amounts = Amounts.of(tasks, config.plan)

@@ -37,7 +37,7 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     """Replay, render and serialise one kept episode again, and compare it with the dataset next to the manifest.
 
     Args:
-        manifest_file: of the run; the ``rlds`` folder is expected next to it.
+        manifest_file: manifest of the run; the ``rlds`` folder is expected next to it.
         out: a new folder for the replay, the frames, and the episode as an RLDS set of its own.
         root: folder of LIBERO's HDF5 demonstrations, if the run started from them.
 

@@ -75,7 +75,7 @@ def _nearest(
         f"{view} upside down": fresh[view][::-1],
         f"{view} mirrored": fresh[view][:, ::-1],
         "a black frame": np.zeros_like(frame),
-        **{f"{other}, turned": _turned(raw) for other, raw in fresh.items() if other != view},
+        **{f"{name}, turned": _turned(raw) for name, raw in fresh.items() if name != view},
     }
     if former is not None:
         candidates[f"{view} of {BEFORE} steps before"] = _turned(former)

@@ -121,9 +121,9 @@ def _steps(
     if needed:
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
     judged = selection.select(rows, verdicts, rejected)
-    shown = [row for row in rows if judged[row.episode_id].kept]
-    shown += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
-    missing = [row for row in shown if not outcome.rendered(row, frames)]
+    to_render = [row for row in rows if judged[row.episode_id].kept]
+    to_render += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
+    missing = [row for row in to_render if not outcome.rendered(row, frames)]
     if missing:
         yield "render", f"the frames of {len(missing)} episodes are not there" + _of(made_anew, "files of frames")
     if needed or missing or of_plan:
@@ -213,10 +213,11 @@ def _time_left(
     speed = machine.known_speed(run)
     if speed is None or not needed:
         return
-    anew = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
+    exports = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
+    validates = exports or any(step.startswith(("manifest", "validate")) for step in steps)
     left = not_made(needed, verdicts, frames) | {
-        "export": float(anew),
-        "validate": float(anew or any(step.startswith(("manifest", "validate")) for step in steps)),
+        "export": float(exports),
+        "validate": float(validates),
     }
     left["GPU"] = left["render"]
     left_s = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(run.config, speed).items()}
