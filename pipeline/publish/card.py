@@ -1,4 +1,4 @@
-"""The dataset card: it explains what a run's folder holds to readers who find it on the hub."""
+"""The dataset card: it explains the content of a repository to readers who find it on the hub."""
 
 import inspect
 import re

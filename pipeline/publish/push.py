@@ -137,21 +137,21 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
 
 
 def send(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
-    """Create the repository on the hub (of HF_ENDPOINT) if need be, send what it does not have, and tag it.
+    """Create the repository on the hub (of HF_ENDPOINT) if necessary, send missing files, and tag the commit.
 
     Files of an earlier upload that the dataset no longer has are deleted by the same commit.
 
     Args:
-        repository: ``owner/name``, or ``name`` for one of your own.
-        private: create a private repository; one that is there must be private.
+        repository: ``owner/name``, or ``name`` for a repository of the token's owner.
+        private: create a private repository; an existing repository must be private.
         replace: overwrite or delete files that are not of an earlier upload of the same run and format.
 
     Returns:
         The address of the commit.
 
     Raises:
-        PipelineError: without a token, without the right to write, if the repository has files of another origin, if
-            a file has changed, or when the network or the hub fails.
+        PipelineError: without a token or without the right to write; if the repository has files of another origin;
+            if a file has changed; when the network or the hub fails.
     """
     api = HfApi()
     try:
@@ -181,7 +181,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             parent_commit=there.commit,
         )
         _refuse_other_content(files_of(api, repository, str(commit.oid)), sent, repository)
-        if upload.tag is not None:  # moved, where it stands on an earlier upload
+        if upload.tag is not None:  # an earlier upload may have the tag, which moves
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
             api.create_tag(repository, tag=upload.tag, repo_type="dataset")

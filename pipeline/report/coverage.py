@@ -98,7 +98,7 @@ def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("camera")]
 
     def points(*names: str) -> dict[str, Floats]:
-        """Return the distinct points of the test tasks, many of which share a camera, and the points of the draws."""
+        """Return distinct points of the test tasks, many of which share a camera, and the perturbations' points."""
         benchmark = np.unique(_points(tested, names), axis=0)
         drawn = np.array([attrgetter(*names)(draw) for draw in draws]).reshape(-1, len(names))
         return {"benchmark": benchmark, "camera": drawn}

@@ -142,8 +142,8 @@ def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, An
     """Compute the paper's table, with policies next to the published models; JSON-serialisable.
 
     A balanced subset has as many easy tasks as hard tasks, but the benchmark has not. An episode is therefore weighted
-    by the number of test tasks of its axis, component and level, divided by the number of them that were run. Parts
-    of the benchmark without an episode are left out of a column, and reported.
+    by the number of test tasks of its axis, component and level, divided by the number of its episodes. Parts of the
+    benchmark without an episode are left out of a column, and reported.
 
     Args:
         policies: name to episodes on test tasks.
@@ -152,9 +152,9 @@ def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, An
         ``source``: reference of the published rows.
         ``tasks``: column to the number of test tasks in it.
         ``shared``: the columns that every evaluated policy was measured on.
-        ``evaluated``: rows with ``name``, ``cells``, which map each measured column to an ``Estimate``, ``total`` over
-        all columns, weighted by their numbers of tasks, `None` if a column was not measured, and ``shared``, the total
-        over the shared columns.
+        ``evaluated``: rows with ``name``, ``cells``, ``total`` and ``shared``. ``cells`` map each measured column to an
+        ``Estimate``. ``total`` is over all columns, weighted by their numbers of tasks; it is `None` if a column was
+        not measured. ``shared`` is the total over the shared columns.
         ``published``: rows with ``name``, ``rates`` by column in percent, ``total``, and ``shared``, which is not in
         the paper.
     """

@@ -88,7 +88,7 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
 
 
 def _differ(found: Mapping[str, Any]) -> bool:
-    """Return whether some policy ran other episodes of a source than the episodes that all policies ran."""
+    """Return whether a policy's number of episodes of a source differs from the number that all policies ran."""
     none = {"all": {"episodes": 0}}
     for source, common in found["common"].items():
         for policy in found["policies"].values():

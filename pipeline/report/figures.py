@@ -1,6 +1,6 @@
 """Small plots as inline SVG: one panel each, as wide as a phone's screen, in the colour of the page's text.
 
-A page arranges panels as its width allows. Text stays text, and everything plotted in ``INK`` takes the colour of the
+A page arranges panels as its width allows. Text stays text. Everything plotted in ``INK`` takes the colour of the
 page's text, so that a figure can be read on light and on dark pages.
 """
 

@@ -175,7 +175,7 @@ def _lerobot(folder: Path) -> Iterator[Found]:
         episodes = []
         for file in files:
             episodes += pq.read_table(file, columns=["episode_index", "tasks"]).to_pylist()
-    # Tools that delete, split or merge episodes do not copy the provenance; their data keep the ids.
+    # Tools that delete, split or merge episodes do not copy the provenance. Then the ids may still be in the data.
     provenance = folder / "meta" / "provenance.parquet"
     stored = pq.read_table(provenance).to_pylist() if provenance.is_file() else []
     labels = {row["episode_index"]: row for row in stored}

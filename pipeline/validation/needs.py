@@ -5,7 +5,8 @@ demonstration.
 
 Sizes are rounded up from four runs of one demonstration of 90 steps (``benchmarks/disk.py``, see ``docs/cost.md``).
 Times of frames and replays come from ``run/work_time.py``. The other times are CPU times of one core of the same
-machine, for the stages of ``configs/starter.yaml`` and of a run of 1,004 episodes, which took 19 % less than estimated.
+machine. They were measured with the stages of ``configs/starter.yaml``, and of a run of 1,004 episodes, which took 19 %
+less time than estimated.
 """
 
 from __future__ import annotations

@@ -42,10 +42,10 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
         root: folder of LIBERO's HDF5 demonstrations, if the run started from them.
 
     Returns:
-        JSON-serialisable: ``identical`` (`None` without a dataset), ``reason`` (``kept``, or why the replay or the
-        rendering was rejected this time), ``versions`` and ``gl_device`` if the manifest states others than this
-        machine has, and ``differs``, column to the steps or values that differ. This project's own version, which the
-        dataset also stores, is not compared.
+        JSON-serialisable: ``identical`` (`None` without a dataset) and ``reason`` (``kept``, or why the replay or the
+        rendering was rejected this time). ``versions`` and ``gl_device`` list differences between the manifest and
+        this machine. ``differs`` maps columns to the steps or values that differ. This project's own version, which
+        the dataset also stores, is not compared.
 
     Raises:
         PipelineError: when the manifest has no such kept episode, or its demonstration is missing or has changed.

@@ -70,8 +70,9 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
     """Check a finished run; memory holds one episode in each worker, and the manifest.
 
     Returns:
-        JSON-serialisable: check to how many episodes (or planned rows, or datasets) were ``checked``, and
-        ``findings``, each with ``dataset``, ``episode`` (`None` if it is about the whole), ``what`` and ``expected``.
+        JSON-serialisable: for each check, the number of episodes (or planned rows, or datasets) that were ``checked``,
+        and ``findings``. Each finding has ``dataset``, ``episode`` (`None` if it is about the whole), ``what`` and
+        ``expected``.
 
     Raises:
         PipelineError: when the manifest or the stores cannot be read.
