@@ -213,7 +213,7 @@ def alive(case: Case) -> Iterator[Fault]:
 
 
 def gripper(case: Case) -> Iterator[Fault]:
-    """Check that commands are -1 or +1, and that the fingers open on one and close on the other."""
+    """Check that commands are -1 or +1, and that the fingers open and close accordingly."""
     commands = SCHEMA.action.gripper
     for copy in case.whole:
         command, state = copy.episode.action[:, 6], copy.episode.state
@@ -241,9 +241,9 @@ def flags(case: Case) -> Iterator[Fault]:
 
 
 def clock(case: Case) -> Iterator[Fault]:
-    """Check that the physics has steps at the frame rate, and that a dataset counts them from 0 and times them so.
+    """Check that physics steps and timestamps keep the frame rate, and that frames are counted from 0.
 
-    Marks that a dataset does not have are skipped.
+    Timestamps and frame numbers are skipped if a dataset does not have them.
     """
     taken = np.diff(case.trajectory.states[:, 0])
     if not np.allclose(taken, 1 / SCHEMA.fps_hz, rtol=0, atol=1e-6):

@@ -166,8 +166,8 @@ def _as_a_whole(dataset: Format[Any], episodes: Mapping[str, Row], cache: Path) 
     results, faults = Results(), []
     try:
         # A loop, because faults that precede an error count.
-        for named_fault in dataset.check(episodes, cache):
-            faults.append(named_fault)
+        for name_and_fault in dataset.check(episodes, cache):
+            faults.append(name_and_fault)
     except PipelineError as error:
         results.note("readable", [_unreadable(dataset, error)], 0)
     for check, checked in (("format", 1), ("ids", len(episodes)), ("splits", len(episodes)), ("readable", 0)):
