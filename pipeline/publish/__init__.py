@@ -1,1 +1,1 @@
-"""What is sent: the card of a dataset, what it owes to whom, and the upload."""
+"""Content for the hub: the card of a dataset, its attributions, and the upload."""

@@ -1,4 +1,4 @@
-"""The dataset card: it explains what a run's folder holds to readers who find it on the hub."""
+"""The dataset card: it explains the content of a repository to readers who find it on the hub."""
 
 import inspect
 import re
@@ -28,16 +28,16 @@ from pipeline.run.counts import Counts, named, origins, tally, targets, tried
 from pipeline.run.run import CARD, FINETUNE, MANIFEST, SHEETS, Run
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
-"""What the card is made from, besides the manifest; in the run's folder."""
+"""Files in the run's folder from which the card is generated, in addition to the manifest."""
 
 CHECKSUMS = "SHA256SUMS"
-"""Of a repository's files, for ``sha256sum --check``."""
+"""File with the checksums of a repository's files, for ``sha256sum --check``."""
 
 REPOSITORY = "OWNER/NAME"
-"""Stands in a card for the repository, which is not known before the upload."""
+"""Placeholder in a card for the repository, which is not known before the upload."""
 
 FREE = re.compile(r"(MIT|Apache-2\.0|CC0-1\.0|CC-BY-\d)")
-"""How the licences begin under which a derived work may be CC BY 4.0."""
+"""Beginnings of the licences under which a derived work may be CC BY 4.0."""
 
 
 TEMPLATES = jinja2.Environment(
@@ -55,7 +55,7 @@ def write(run: Run) -> None:
     """Write ``card/<format>/`` of a run, the files next to the dataset at the root of a repository.
 
     Raises:
-        PipelineError: when something that it describes cannot be read, or edits of the card would be lost.
+        PipelineError: when a file that the card describes cannot be read, or edits of the card would be lost.
     """
     rows, formats = run.manifest, run.formats
     settings = manifest.settings(run.manifest_file)
@@ -65,13 +65,14 @@ def write(run: Run) -> None:
     sheets = [axis for axis in axes if (run.path(SHEETS) / f"{axis}.png").is_file()]
     made_from = {name: checksum(run.path(name)) for name in (MANIFEST, *REPORTS)}
     with generated(run.path(CARD), made_from) as folder:
-        for one in formats:
-            (folder / one.name / "pictures").mkdir(parents=True)
+        for dataset in formats:
+            (folder / dataset.name / "pictures").mkdir(parents=True)
             for axis in sheets:
-                shutil.copyfile(run.path(SHEETS) / f"{axis}.png", folder / one.name / "pictures" / f"{axis}.png")
-            others = [other.title for other in formats if other is not one]
+                picture = folder / dataset.name / "pictures" / f"{axis}.png"
+                shutil.copyfile(run.path(SHEETS) / f"{axis}.png", picture)
+            others = [other.title for other in formats if other is not dataset]
             text = render(
-                one,
+                dataset,
                 others,
                 rows,
                 reports,
@@ -82,11 +83,11 @@ def write(run: Run) -> None:
                 episodes=settings.episodes,
                 publish=run.config.publish,
             )
-            (folder / one.name / "README.md").write_text(text)
-            sums = {one.repository_path(path): sha256 for path, sha256 in one.record().files.items()}
+            (folder / dataset.name / "README.md").write_text(text)
+            sums = {dataset.repository_path(path): sha256 for path, sha256 in dataset.record().files.items()}
             sums[MANIFEST] = made_from[MANIFEST]
             lines = [f"{sha256}  {path}\n" for path, sha256 in sorted(sums.items())]
-            (folder / one.name / CHECKSUMS).write_text("".join(lines))
+            (folder / dataset.name / CHECKSUMS).write_text("".join(lines))
 
 
 def render(
@@ -102,15 +103,18 @@ def render(
     episodes: Mapping[str, int],
     publish: PublishConfig,
 ) -> str:
-    """The card of one format, with the hub's metadata in front.
+    """Render the card of one format, with the hub's metadata in front.
 
     Args:
+        shown: the format.
         others: titles of the other formats.
-        reports: what the files of ``REPORTS`` hold.
-        clients: the section of that name in ``finetune.yaml``: where and how each policy's code is called.
+        rows: the manifest.
+        reports: contents of the files of ``REPORTS``.
+        clients: the section of that name in ``finetune.yaml``, which states how each policy's code is called.
         sheets: the axes that have a picture.
-        source: of the demonstrations, ``starter`` or ``hdf5``.
-        episodes: ``plan.episodes``, empty where the manifest does not have it.
+        name: name of the dataset.
+        source: source of the demonstrations, ``starter`` or ``hdf5``.
+        episodes: ``plan.episodes``, empty if the manifest does not have it.
         publish: the publisher's statements.
     """
     leakage, validation, statistics = (reports[report] for report in REPORTS)
@@ -120,7 +124,7 @@ def render(
     own_suites = [suite for suite in kept_suites if suite not in SUITES]
     own_rewrites = _own_rewrites(kept)
     libero = own_suites != kept_suites
-    free = all(FREE.match(one.licence) for one in owed) and not (own_suites or own_rewrites)
+    free = all(FREE.match(credit.licence) for credit in owed) and not (own_suites or own_rewrites)
     axes = _axes(kept, shown)
     demos = {row["demo_id"] for row in kept}
     of_task = Counter(demo.rpartition("/")[0] for demo in demos)
@@ -156,7 +160,7 @@ def render(
         statistics=statistics,
         validation=validation,
         failed=[check for check, found in validation.items() if found["findings"]],
-        # Any will do: whoever has the dataset can try the command as it stands.
+        # Any kept episode is an example, with which readers who have the dataset can run the command unchanged.
         example=min(row["episode_id"] for row in kept),
         versions=manifest.made_with(kept[0]),
         devices=sorted({row["gl_device"] for row in kept}),
@@ -167,23 +171,27 @@ def render(
 
 
 def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
-    """Everything of others' that episodes show, by kind and name, to how many of them show it.
+    """Count the episodes that show each third-party work, sorted by kind and name.
 
     Args:
         perturbations: for each episode, the column of that name in the plan or the manifest. Nothing else is read.
     """
-    shown = Counter(credit for text in perturbations for credit in {*chain(*(p.credits() for p in from_json(text)))})
-    return dict(sorted(shown.items(), key=lambda one: (one[0].kind, *one[0])))
+    counts: Counter[Credit] = Counter()
+    for text in perturbations:
+        credits = [perturbation.credits() for perturbation in from_json(text)]
+        counts.update({*chain(*credits)})
+    return dict(sorted(counts.items(), key=lambda item: (item[0].kind, *item[0])))
 
 
 def _own_rewrites(kept: Iterable[Mapping[str, Any]]) -> bool:
-    """Whether an instruction is a rewrite that the shipped bank does not have."""
-    return any(
-        isinstance(change, LanguagePerturbation)
-        and change.text not in chain(*load_bank().get(row["suite"], {}).get(row["task"], {}).values())
-        for row in kept
-        for change in from_json(row["perturbations"])
-    )
+    """Return whether an instruction is a rewrite that the shipped bank does not have."""
+    for row in kept:
+        for change in from_json(row["perturbations"]):
+            if isinstance(change, LanguagePerturbation):
+                of_task = load_bank().get(row["suite"], {}).get(row["task"], {})
+                if change.text not in chain(*of_task.values()):
+                    return True
+    return False
 
 
 def _metadata(shown: AnyFormat, name: str, publish: PublishConfig, *, free: bool, libero: bool) -> DatasetCardData:
@@ -201,16 +209,19 @@ def _metadata(shown: AnyFormat, name: str, publish: PublishConfig, *, free: bool
 
 
 def _axes(kept: Iterable[Mapping[str, Any]], shown: AnyFormat) -> dict[str, dict[str, Any]]:
-    """Axis to its kinds of change, and how many episodes show each component and level, combinations included."""
-    found: dict[str, dict[str, Any]] = {}
+    """Collect, for each axis, its kinds of change, and the number of episodes with each component and level.
+
+    Combinations count for each of their axes.
+    """
+    axes: dict[str, dict[str, Any]] = {}
     for row in kept:
         for change in from_json(row["perturbations"]):
-            axis = found.setdefault(change.axis, {"kinds": {}, "levels": Counter()})
+            axis = axes.setdefault(change.axis, {"kinds": {}, "levels": Counter()})
             what = (inspect.getdoc(type(change)) or "").partition("\n")[0]
             kind = f"{what} Changes {_changes(change, shown)}."
             axis["kinds"].setdefault(kind, Counter())[change.component] += 1
             axis["levels"][change.level] += 1
-    return found
+    return axes
 
 
 def _changes(change: Perturbation, shown: AnyFormat) -> str:
@@ -226,14 +237,19 @@ def _yields(rows: Sequence[Mapping[str, Any]]) -> list[list[object]]:
     body: list[list[object]] = []
     for axis in named(tried(rows), "axis"):
         counts = Counts.of(rows, axis=axis)
-        found = (", ".join(f"{name} {count}" for name, count in one.get(axis, {}).items()) for one in (lost, modes))
-        told = [text or None for text in found]
-        body.append([axis, counts.planned, counts.replayed, counts.kept, f"{counts.kept / counts.planned:.0%}", *told])
+        share = f"{counts.kept / counts.planned:.0%}"
+        cells = [_listed(lost.get(axis, {})), _listed(modes.get(axis, {}))]
+        body.append([axis, counts.planned, counts.replayed, counts.kept, share, *cells])
     return body
 
 
+def _listed(counts: Mapping[str, int]) -> str | None:
+    """List names and their numbers; `None` if there is no name."""
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or None
+
+
 def _cell(value: object) -> str:
-    """Of a table in Markdown."""
+    """Format a cell of a table in Markdown."""
     if value is None:
         return "-"
     if isinstance(value, float):

@@ -1,11 +1,12 @@
-"""Upload a dataset to the Hugging Face hub: its files, its card, and what it was made and checked with.
+"""Upload of a dataset to the Hugging Face hub: its files, its card, its recipe and the reports on it.
 
 Only files that a stage recorded are sent, with the recorded content. ``upload.json`` records the upload itself in the
-repository, by which the next one knows which files it may replace.
+repository; the next upload reads there which files it may replace.
 
-Everything goes into one commit, so that a reader finds all of a dataset or none of it. Large files are sent before that
-and stay there if the upload is cut off: run again, only the rest is sent. (``upload_large_folder`` of huggingface_hub
-leaves notes among the files, shows half a dataset meanwhile, and tries for ever where a token may not write.)
+All files go into one commit, so that a reader finds all of a dataset or none of it. Large files are sent before the
+commit, and the hub keeps them if the upload is interrupted; the next try sends only the rest. (``upload_large_folder``
+of huggingface_hub leaves notes among the files, shows half a dataset meanwhile, and retries for ever if a token may not
+write.)
 """
 
 from collections.abc import Mapping, Set
@@ -31,7 +32,7 @@ from pipeline.run.export import OFT_STATISTICS
 from pipeline.run.run import CARD, FINETUNE, Run
 
 FAILURES = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
-"""What an upload raises. Only before huggingface-hub 1 there is a ``XetError``; only since then it speaks by httpx."""
+"""Errors of an upload. Only huggingface-hub before version 1 has a ``XetError``; only later versions use httpx."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,9 @@ class Upload:
 
     Attributes:
         run: name of the run.
-        format: of the dataset.
-        dataset: path in the repository to file here, of the dataset.
-        others: the same of all other files.
+        format: name of the dataset's format.
+        dataset: path in the repository to local file, for the files of the dataset.
+        others: path in the repository to local file, for all other files.
         sha256: path in the repository to the recorded checksum.
         folders: top folders of the repository in which only the dataset may lie.
         tag: name that the commit gets, if a client's loader asks for it.
@@ -62,22 +63,24 @@ class Upload:
         return dict(sorted({**self.dataset, **self.others}.items()))
 
     def summary(self) -> str:
-        """Run and format, files and megabytes of each folder, the names of files outside the dataset, and the tag."""
+        """Describe the upload in words.
+
+        Returns:
+            Run and format, files and megabytes of each folder, the names of files outside the dataset, and the tag.
+        """
         folders = grouped((f"{Path(path).parent}/", file.stat().st_size) for path, file in self.files.items())
         folders["in all"] = [size for sizes in folders.values() for size in sizes]
-        return "\n".join(
-            [
-                f"run {self.run}, format {self.format}",
-                *(f"{len(sizes):6,} files {sum(sizes) / 1e6:10,.1f} MB  {name}" for name, sizes in folders.items()),
-                "outside the dataset:",
-                *(f"  {path}" for path in sorted([*self.others, UPLOAD])),
-                f"tag: {self.tag or 'none'}",
-            ]
-        )
+        lines = [f"run {self.run}, format {self.format}"]
+        for name, sizes in folders.items():
+            lines.append(f"{len(sizes):6,} files {sum(sizes) / 1e6:10,.1f} MB  {name}")
+        lines.append("outside the dataset:")
+        lines += [f"  {path}" for path in sorted([*self.others, UPLOAD])]
+        lines.append(f"tag: {self.tag or 'none'}")
+        return "\n".join(lines)
 
 
 def prepare(target: Format[Any], run: Run) -> Upload:
-    """Gather what belongs to a dataset; nothing is sent.
+    """Gather the files that belong to a dataset; nothing is sent.
 
     Args:
         target: a dataset of the run.
@@ -88,29 +91,30 @@ def prepare(target: Format[Any], run: Run) -> Upload:
     recorded = target.record().files
     dataset = {target.repository_path(path): file for path, file in _exactly(target.folder, {*recorded}).items()}
     _refuse_unvalidated(run, dataset, target.name)
-    for fault in (fault for file in target.written() for fault in file.faults()):
-        raise PipelineError(fault.what, expected=fault.expected)
+    for file in target.written():
+        for fault in file.faults():
+            raise PipelineError(fault.what, expected=fault.expected)
     sha256 = {target.repository_path(path): sha256 for path, sha256 in recorded.items()}
     others: dict[str, Path] = {}
     for folder, below, inside in ((CARD, target.name, ""), (FINETUNE, "", f"{FINETUNE}/")):
         checksums = record(run.path(folder)).files
-        for path, file in unchanged(run.path(folder), below).items():
+        for path, source in unchanged(run.path(folder), below).items():
             name = inside + path.removeprefix(f"{below}/")
-            others[name], sha256[name] = file, checksums[path]
-    for name, of_file in record(run.path(CARD)).made_from.items():
+            others[name], sha256[name] = source, checksums[path]
+    for name, recorded_sha256 in record(run.path(CARD)).made_from.items():
         source = run.path(name)
-        if source.is_symlink() or checksum(source) != of_file:
+        if source.is_symlink() or checksum(source) != recorded_sha256:
             raise PipelineError(
                 "is a link, or has changed since the card was generated from it", where=source, remedy=MAKE_AGAIN
             )
-        others[name], sha256[name] = source, of_file
-    # Its own folders too where it has nothing in them now, such as videos.
+        others[name], sha256[name] = source, recorded_sha256
+    # Folders of the format that are empty now, such as videos, belong to the dataset, too.
     folders = target.repository_folders() | {path.partition("/")[0] for path in dataset if "/" in path}
     return Upload(run.name, target.name, dataset, dict(sorted(others.items())), sha256, folders, target.tag())
 
 
 def compare(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
-    """Read the repository on the hub, and say what an upload would delete there; nothing is sent.
+    """Read the repository on the hub, and list the files that an upload would delete there; nothing is sent.
 
     Returns:
         Words: the state of the repository, and every file that would be deleted.
@@ -133,21 +137,21 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
 
 
 def send(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
-    """Create the repository on the hub (of HF_ENDPOINT) if need be, send what it does not have, and tag it.
+    """Create the repository on the hub (of HF_ENDPOINT) if necessary, send missing files, and tag the commit.
 
     Files of an earlier upload that the dataset no longer has are deleted by the same commit.
 
     Args:
-        repository: ``owner/name``, or ``name`` for one of your own.
-        private: create a private repository; one that is there must be private.
+        repository: ``owner/name``, or ``name`` for a repository of the token's owner.
+        private: create a private repository; an existing repository must be private.
         replace: overwrite or delete files that are not of an earlier upload of the same run and format.
 
     Returns:
         The address of the commit.
 
     Raises:
-        PipelineError: without a token, without the right to write, if the repository has files of another origin, if
-            a file has changed, or when the network or the hub fails.
+        PipelineError: without a token or without the right to write; if the repository has files of another origin;
+            if a file has changed; when the network or the hub fails.
     """
     api = HfApi()
     try:
@@ -177,7 +181,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             parent_commit=there.commit,
         )
         _refuse_other_content(files_of(api, repository, str(commit.oid)), sent, repository)
-        if upload.tag is not None:  # moved, where it stands on an earlier upload
+        if upload.tag is not None:  # an earlier upload may have the tag, which moves
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
             api.create_tag(repository, tag=upload.tag, repo_type="dataset")
@@ -187,12 +191,12 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
 
 
 def _full_name(api: HfApi, repository: str) -> str:
-    """Put the owner in front, if it was left out."""
+    """Prepend the token's owner to a name without an owner."""
     return repository if "/" in repository else f"{api.whoami()['name']}/{repository}"
 
 
 def _deleted(there: Repository, new: LastUpload, folders: Set[str], *, private: bool, replace: bool) -> list[str]:
-    """List the paths that an upload deletes, if it is not refused."""
+    """List the paths that an upload deletes, or reject the upload."""
     if private and not there.private:
         raise PipelineError(
             "is public, and --private asks for a private repository",
@@ -203,7 +207,7 @@ def _deleted(there: Repository, new: LastUpload, folders: Set[str], *, private: 
 
 
 def _contents(upload: Upload, repository: str) -> tuple[dict[str, Path | bytes], LastUpload]:
-    """Collect what is sent: the dataset as paths, all other files as bytes, and the checksums.
+    """Collect the content to send: the dataset as paths, all other files as bytes, and the checksums.
 
     The card gets the repository's name in the commands that load it.
 
@@ -226,7 +230,7 @@ def _contents(upload: Upload, repository: str) -> tuple[dict[str, Path | bytes],
 
 
 def _refuse_other_content(files: Mapping[str, RepoFile], sent: LastUpload, repository: str) -> None:
-    """Stop if the hub has other content than was meant, as of a file that changed while it was sent."""
+    """Raise an error if the hub has other content than recorded, such as a file that changed while it was sent."""
     wrong = [path for path, content in sent.files.items() if path not in files or not content.is_of(files[path])]
     if wrong:
         raise PipelineError(
@@ -237,14 +241,16 @@ def _refuse_other_content(files: Mapping[str, RepoFile], sent: LastUpload, repos
 
 
 def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
-    """The wanted files under ``root``, when there is nothing else but OFT's statistics, and nothing leads elsewhere."""
-    found = {
-        file.relative_to(root).as_posix(): file
-        for file in root.rglob("*")
-        if (file.is_symlink() or file.is_file()) and not OFT_STATISTICS.fullmatch(file.name)
-    }
-    linked = sorted(path for path, file in found.items() if root.resolve() not in file.resolve().parents)
-    foreign = sorted(found.keys() - wanted)
+    """List the wanted files below ``root``; raise an error for missing files, further files, and links out of ``root``.
+
+    OFT's statistics are ignored.
+    """
+    files = {}
+    for file in root.rglob("*"):
+        if (file.is_symlink() or file.is_file()) and not OFT_STATISTICS.fullmatch(file.name):
+            files[file.relative_to(root).as_posix()] = file
+    linked = sorted(path for path, file in files.items() if root.resolve() not in file.resolve().parents)
+    foreign = sorted(files.keys() - wanted)
     if foreign or linked:
         raise PipelineError(
             f"{len(foreign)} files that are not of the dataset, {len(linked)} that lie elsewhere, such as "
@@ -252,16 +258,17 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
             where=root,
             remedy=f"move them away (training may leave files), and `{MAKE_AGAIN}`",
         )
-    if missing := sorted(wanted - found.keys()):
+    missing = sorted(wanted - files.keys())
+    if missing:
         raise PipelineError(f"lacks {len(missing)} files, such as {missing[0]}", where=root, remedy=MAKE_AGAIN)
-    return found
+    return files
 
 
 def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
-    """Stop unless these very files passed validation, and the card tells of it."""
+    """Raise an error unless exactly these files passed validation, and the card was written after it."""
     report, card = run.validation_file, run.path(CARD) / name / "README.md"
     checks = read_json(report)
-    failed = [f"{check} ({found['findings'][0]})" for check, found in checks.items() if found["findings"]]
+    failed = [f"{check} ({result['findings'][0]})" for check, result in checks.items() if result["findings"]]
     if failed or not checks:
         raise PipelineError(
             f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}",
@@ -277,7 +284,7 @@ def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
             raise PipelineError(
                 f"older than {before}, which it is about",
                 where=after,
-                # Forced: where a file was written anew with the same content, DVC sees nothing to do.
+                # The scripts run without DVC, which skips stages if a file was written again with equal content.
                 remedy="python stages/validate.py CONFIG && python stages/card.py CONFIG",
             )
 

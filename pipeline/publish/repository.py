@@ -1,4 +1,4 @@
-"""A repository on the hub: what it holds, which upload that was, and what another upload would delete or overwrite."""
+"""A repository on the hub: its files, its last upload, and the files that another upload would delete or overwrite."""
 
 import hashlib
 from collections.abc import Mapping, Set
@@ -15,20 +15,20 @@ from pipeline.errors import PipelineError
 from pipeline.types import Frozen
 
 UPLOAD = "upload.json"
-"""File of a repository that says what the last upload was."""
+"""File of a repository that records the last upload."""
 
 OF_THE_HUB = ".gitattributes"
-"""The hub writes it when a repository is created; it stays."""
+"""File that the hub writes when a repository is created; uploads keep it."""
 
 MAX_NAMED = 20
 BLOCK_BYTES = 2**20
 
 
 class Content(Frozen):
-    """Two checksums of a file: the hub shows the first of a large file, the second of a small one.
+    """Two checksums of a file: the hub states ``sha256`` for large files and ``blob`` for small files.
 
     Attributes:
-        sha256: of the content.
+        sha256: SHA-256 of the content.
         blob: SHA-1 by which git names the content, as ``git hash-object`` prints it.
     """
 
@@ -36,7 +36,7 @@ class Content(Frozen):
     blob: str
 
     def is_of(self, file: RepoFile) -> bool:
-        """Whether a file on the hub has this content."""
+        """Return whether a file on the hub has this content."""
         return file.lfs.sha256 == self.sha256 if file.lfs else file.blob_id == self.blob
 
 
@@ -45,7 +45,7 @@ class LastUpload(Frozen):
 
     Attributes:
         run: name of the run.
-        format: of the dataset.
+        format: name of the dataset's format.
         files: path in the repository to content, of all other uploaded files.
     """
 
@@ -56,13 +56,14 @@ class LastUpload(Frozen):
 
 @dataclass(frozen=True)
 class Repository:
-    """A dataset repository as it is now.
+    """The current state of a dataset repository.
 
     Attributes:
         name: ``owner/name``.
         commit: the last one.
-        files: path to what the hub says of the file, without ``OF_THE_HUB``.
-        upload: the last upload; None if there was none, or its record cannot be read.
+        private: True if only its owner may see it.
+        files: path to the hub's description of the file, without ``OF_THE_HUB``.
+        upload: the last upload; `None` without an upload, or if its record cannot be read.
     """
 
     name: str
@@ -92,7 +93,7 @@ def content_of(file: Path | bytes) -> Content:
 
 
 def read(api: HfApi, name: str) -> Repository | None:
-    """Read which files a dataset repository has; None if it does not exist, or the token may not see it.
+    """Read the state of a dataset repository; return `None` if it does not exist, or the token may not see it.
 
     Raises:
         HfHubHTTPError: and other errors of the network.
@@ -132,20 +133,21 @@ def deletions(there: Repository, new: LastUpload, folders: Set[str], *, replace:
     Files next to an earlier upload of the same run and format stay, unless they are in folders of the dataset.
 
     Args:
+        there: the repository.
         new: the upload.
-        folders: top folders of the repository in which only the dataset may lie.
-        replace: allow what is refused else; a dataset of another origin then goes with all its files.
+        folders: top folders of the repository that may contain only the dataset.
+        replace: accept uploads that are rejected otherwise; a dataset of another origin is then deleted completely.
 
     Raises:
-        PipelineError: if the repository has anything that is not an earlier upload of the same run and format, and
-            would be deleted, overwritten or mixed with the dataset.
+        PipelineError: if the repository has files that are not of an earlier upload of the same run and format, and
+            that would be deleted, overwritten or mixed with the dataset.
     """
     mine = {*new.files, UPLOAD}
     old = there.upload
     if old is None or (old.run, old.format) != (new.run, new.format):
-        known = "files of unknown origin" if old is None else f"the upload of run {old.run}, format {old.format}"
+        origin = "files of unknown origin" if old is None else f"the upload of run {old.run}, format {old.format}"
         if there.files and not replace:
-            _refuse(there, f"has {known}", list(there.files), new)
+            _refuse(there, f"has {origin}", list(there.files), new)
         return sorted(there.files.keys() - mine)
 
     foreign: list[str] = []

@@ -1,1 +1,1 @@
-"""What is looked at: the report of a run, contact sheets, previews, and the report of evaluations."""
+"""Pages and pictures for people: the report of a run, contact sheets, previews, and the report of evaluations."""

@@ -1,7 +1,8 @@
-"""Panels for each axis: the parameters that a run drew beside those of the test tasks, and how far these are away."""
+"""Panels for each axis: the parameters of a run next to those of the test tasks, and the distances between them."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,14 +25,15 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 
 STUDY_TABLE_M = np.array([-0.2, 0.0])
-"""Where the study's table stands; all other arenas' surfaces are centred (LIBERO's ``study_table_offset``)."""
+"""Position of the study's table; all other arenas' surfaces are centred (LIBERO's ``study_table_offset``)."""
 
 
 class Draw(NamedTuple):
     """One perturbation of a kept episode.
 
     Attributes:
-        resolved: what it did in the scene, None where nothing was recorded.
+        made: the perturbation.
+        resolved: its recorded effect in the scene, `None` without a record.
     """
 
     task: Task
@@ -40,53 +42,66 @@ class Draw(NamedTuple):
 
 
 class AxisPlots(NamedTuple):
-    """What is shown of one axis: what there is to say of the test set, and the plots."""
+    """A note on the test set, and the plots of one axis."""
 
     note: str
     panels: list[Panel]
 
 
 def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
-    """The coverage of one axis by the draws on it."""
+    """Plot the coverage of one axis by its perturbations."""
     plots: dict[str, Callable[[Sequence[Any], TestSet], AxisPlots]] = {
         **{"camera": _camera, "light": _light, "background": _background, "noise": _noise},
         **{"language": _language, "layout": _layout, "pose": _pose, "robot": _robot},
     }
     made: Sequence[Any] = draws if axis in ("language", "layout") else [draw.made for draw in draws]
-    shown = plots[axis](made, test) if axis in plots else _numbers(axis, made, test)
+    axis_plots = plots[axis](made, test) if axis in plots else _numbers(axis, made, test)
     unit = AXES[axis].draws[0].unit
     if unit is None or not test.of(axis):
-        return shown
-    return AxisPlots(shown.note, [*shown.panels, _distances(axis, draws, test, unit)])
+        return axis_plots
+    return AxisPlots(axis_plots.note, [*axis_plots.panels, _distances(axis, draws, test, unit)])
 
 
 def _distances(axis: str, draws: Sequence[Draw], test: TestSet, unit: str) -> Panel:
-    """How far each test task is from the nearest draw; those that no draw can be compared with are left out."""
+    """Plot the distance from each test task to the nearest perturbation.
+
+    Test tasks that cannot be compared with any perturbation are left out.
+    """
     least = leakage.distances(axis, [(draw.made, draw.task) for draw in draws], test)
     components = np.array([task.component for task in test.of(axis)])
-    rows = {
-        component.replace("_", " "): {axis: least[(components == component) & np.isfinite(least)]}
-        for component in dict.fromkeys(components.tolist())
-    }
+    rows = {}
+    for component in dict.fromkeys(components.tolist()):
+        comparable = (components == component) & np.isfinite(least)
+        rows[component.replace("_", " ")] = {axis: least[comparable]}
     return strips("from each test task to the nearest draw", rows, unit)
 
 
 def _numbers(axis: str, draws: Sequence[Perturbation], test: TestSet) -> AxisPlots:
-    """An axis that has no plots of its own: the level and every parameter that is one number."""
+    """Plot an axis without plots of its own: the level and every parameter that is a number."""
     names = [name for name, field in AXES[axis].draws[0].model_fields.items() if field.annotation in (int, float)]
-    values = {name: np.array([getattr(p, name) for p in draws], float) for name in ("level", *names)}
-    shown = [strips(name.replace("_", " "), {"draws": {axis: own}}, name) for name, own in values.items()]
-    return AxisPlots(f"{len(test.of(axis)):,} test tasks.", shown)
+    panels = []
+    for name in ("level", *names):
+        values = np.array([getattr(draw, name) for draw in draws], float)
+        panels.append(strips(name.replace("_", " "), {"draws": {axis: values}}, name))
+    return AxisPlots(f"{len(test.of(axis)):,} test tasks.", panels)
+
+
+def _points(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Floats:
+    """Collect the named numbers of each record as points (N, len(names))."""
+    points = []
+    for record in records:
+        points.append([float(record[name]) for name in names])
+    return np.array(points).reshape(-1, len(names))
 
 
 def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("camera")]
 
     def points(*names: str) -> dict[str, Floats]:
-        """Distinct points, as many test tasks share one camera."""
-        shown = np.array([[float(known[name]) for name in names] for known in tested]).reshape(-1, len(names))
-        own = np.array([[getattr(p, name) for name in names] for p in draws]).reshape(-1, len(names))
-        return {"benchmark": np.unique(shown, axis=0), "camera": own}
+        """Return distinct points of the test tasks, many of which share a camera, and the perturbations' points."""
+        benchmark = np.unique(_points(tested, names), axis=0)
+        drawn = np.array([attrgetter(*names)(draw) for draw in draws]).reshape(-1, len(names))
+        return {"benchmark": benchmark, "camera": drawn}
 
     scales = {name: values.ravel() for name, values in points("distance_scale").items()}
     return AxisPlots(
@@ -118,7 +133,7 @@ def _background(draws: Sequence[BackgroundPerturbation], test: TestSet) -> AxisP
     names = [covering.texture for p in draws for covering in p.coverings]
     tested = test.of("background")
     images = {task.parameters[part] for task in tested for part in ("surface", "wall") if part in task.parameters}
-    # Such as procedural:brick/028 or metaworld:floor2.png.
+    # Examples of names: procedural:brick/028, metaworld:floor2.png.
     sources = Counter(name.rpartition("/" if "/" in name else ":")[0] for name in names)
     return AxisPlots(
         f"{len(set(names))} different images in {len(draws)} draws. The {len(tested):,} test tasks show {len(images)}; "
@@ -130,15 +145,15 @@ def _background(draws: Sequence[BackgroundPerturbation], test: TestSet) -> AxisP
 def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> AxisPlots:
     rows = {}
     for component in dict.fromkeys(task.component for task in test.of("noise")):
-        own = [p for p in draws if p.component == component]
+        of_component = [p for p in draws if p.component == component]
         tested = [task.parameters for task in test.of("noise") if task.component == component]
-        severities: Floats = np.unique([float(known["severity"]) for known in tested])
+        severities: Floats = np.unique([float(parameters["severity"]) for parameters in tested])
         at = np.array([])
-        if own:
-            name, clean = own[0].effect.strength
-            ladder = sorted({(float(known["severity"]), float(known[name])) for known in tested})
+        if of_component:
+            name, clean = of_component[0].effect.strength
+            ladder = sorted({(float(parameters["severity"]), float(parameters[name])) for parameters in tested})
             steps, values = np.array([(0.0, float(clean)), *ladder]).T
-            at = np.interp([float(getattr(p.effect, name)) for p in own], values, steps)
+            at = np.interp([float(getattr(p.effect, name)) for p in of_component], values, steps)
         rows[component] = {"benchmark": severities, "noise": at}
     return AxisPlots(
         f"{len(test.of('noise')):,} test tasks at ten severities of each kind; a draw stands where its strength would, "
@@ -151,12 +166,12 @@ def _language(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     tested = test.of("language")
     original = {(t.suite, t.base): find_task(t.suite, t.base).instruction for t in tested}
     far = np.array([distance(str(t.parameters["text"]), original[t.suite, t.base]) for t in tested])
-    own = [(draw.made.component, distance(draw.made.text, draw.task.instruction)) for draw in draws]
-    rows = {
-        name.replace("_", " "): {"language": np.array([away for component, away in own if component == name])}
-        for name in CLASSES
-    }
-    every = {"benchmark": far, "language": np.array([away for _, away in own])}
+    edited = [(draw.made.component, distance(draw.made.text, draw.task.instruction)) for draw in draws]
+    rows = {}
+    for name in CLASSES:
+        shares = [share for component, share in edited if component == name]
+        rows[name.replace("_", " ")] = {"language": np.array(shares)}
+    every = {"benchmark": far, "language": np.array([share for _, share in edited])}
     label = "share of characters edited"
     return AxisPlots(
         f"{len(tested):,} test instructions, of no stated class. The distance is the share of characters to edit.",
@@ -169,16 +184,19 @@ def _language(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
 
 def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("layout")]
-    places = [pair.split(",") for known in tested for pair in str(known["positions"]).split(";") if pair]
-    own = []
+    tested_at = []
+    for parameters in tested:
+        tested_at += [pair.split(",") for pair in str(parameters["positions"]).split(";") if pair]
+    placed_at = []
     for draw in draws:
         centre = STUDY_TABLE_M if bddl.read(draw.task.bddl_file).arena == "study" else np.zeros(2)
         placed = draw.resolved["objects"] if draw.resolved else ()
-        own += [np.array(thing["position_m"][:2]) - centre for thing in placed]
-    counts = [len(draw.made.objects) for draw in draws]
+        placed_at += [np.array(thing["position_m"][:2]) - centre for thing in placed]
     categories = {added.category for draw in draws for added in draw.made.objects}
-    groups = {"benchmark": np.unique(np.array(places, float).reshape(-1, 2), axis=0), "layout": np.array(own)}
-    number = {"benchmark": np.array([float(known["count"]) for known in tested]), "layout": np.array(counts, float)}
+    groups = {"benchmark": np.unique(np.array(tested_at, float).reshape(-1, 2), axis=0), "layout": np.array(placed_at)}
+    tested_counts = [float(parameters["count"]) for parameters in tested]
+    counts = [len(draw.made.objects) for draw in draws]
+    number = {"benchmark": np.array(tested_counts), "layout": np.array(counts, float)}
     return AxisPlots(
         f"{len(tested):,} test tasks. Objects of {len(categories)} categories were added; a run stops where a test "
         "task in the same scene adds one of these.",
@@ -191,12 +209,12 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
 
 def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("pose")]
-    targets = np.array([[float(p["dx_m"]), float(p["dy_m"])] for p in tested if "dx_m" in p]).reshape(-1, 2)
+    targets = _points([parameters for parameters in tested if "dx_m" in parameters], ("dx_m", "dy_m"))
     alone = [p for p in draws if isinstance(p, PosePerturbation)]
     scenes = [p for p in draws if isinstance(p, ScenePerturbation)]
 
-    def to(title: str, tests: Floats, own: Sequence[tuple[float, float]]) -> Panel:
-        groups = {"benchmark": 100 * tests, "pose": 100 * np.array(own).reshape(-1, 2)}
+    def to(title: str, tests: Floats, shifts_m: Sequence[tuple[float, float]]) -> Panel:
+        groups = {"benchmark": 100 * tests, "pose": 100 * np.array(shifts_m).reshape(-1, 2)}
         return scatter(title, groups, "dx (cm)", "dy (cm)", equal=True)
 
     panels = []
@@ -206,8 +224,8 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
         panels.append(strips("how far it turns", turns, "degrees"))
     if scenes or not alone:
         moved = np.array([shift for p in tested for shift in displacements(p).values()]).reshape(-1, 2)
-        own = [(move.dx_m, move.dy_m) for p in scenes for move in p.moves]
-        panels.append(to("where each thing of a scene goes", moved, own))
+        shifts_m = [(move.dx_m, move.dy_m) for p in scenes for move in p.moves]
+        panels.append(to("where each thing of a scene goes", moved, shifts_m))
     return AxisPlots(
         f"{len(tested):,} test tasks, of which {len(targets):,} move the target, and all of which move everything "
         f"else as well. {len(scenes)} of {len(draws)} draws move the whole scene. Turns are this project's own.",
@@ -218,9 +236,9 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
 def _robot(draws: Sequence[RobotPerturbation], test: TestSet) -> AxisPlots:
     ids = [int(task.parameters["id"]) - 1 for task in test.of("robot")]
     tested = benchmark_offsets_rad()[ids].reshape(-1, 7)
-    own = np.array([p.joint_offsets_rad for p in draws]).reshape(-1, 7)
-    joints = {f"joint {n + 1}": {"benchmark": np.unique(tested[:, n]), "robot": own[:, n]} for n in range(7)}
-    norms = {"benchmark": np.linalg.norm(tested, axis=1), "robot": np.linalg.norm(own, axis=1)}
+    offsets = np.array([p.joint_offsets_rad for p in draws]).reshape(-1, 7)
+    joints = {f"joint {n + 1}": {"benchmark": np.unique(tested[:, n]), "robot": offsets[:, n]} for n in range(7)}
+    norms = {"benchmark": np.linalg.norm(tested, axis=1), "robot": np.linalg.norm(offsets, axis=1)}
     return AxisPlots(
         f"{len(ids):,} test tasks with {len(set(ids))} different offsets.",
         [

@@ -1,4 +1,4 @@
-"""All that a report of evaluations says, as JSON: rates, the paper's table, comparisons, failures."""
+"""Content of a report of evaluations, as JSON: rates, the paper's table, comparisons, failures."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,66 +17,84 @@ from pipeline.grouping import grouped
 from pipeline.testset import benchmark
 
 SOURCES = ("libero_plus", "own", "libero")
-"""Of tasks, in a report's order; others follow."""
+"""Sources of tasks, in a report's order; other sources follow."""
 
 FAILURES = 3
-"""So many are shown of each policy, source and axis."""
+"""Number of failures shown of each policy, source and axis."""
 
 _FACTS = ("episode", "source", "suite", "name", "axis", "component", "level", "instruction", "reason", "steps", "looks")
 
 
 def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
-    """The findings, JSON-serialisable.
+    """Compute the findings of evaluations, JSON-serialisable.
 
     Returns:
         ``policies``: name to settings, versions, number of refused episodes, ``overall``: the ``success_rate`` of all
         its episodes, and ``results``: ``summary`` by source.
-        ``paper_table``: see there; None where no test task was run.
-        ``comparisons``: each two policies on the episodes of a source that both ran, see ``compare``.
-        ``common``: source to the number of episodes that all policies ran which ran any of it.
+        ``paper_table``: see ``paper_table``; `None` if no test task was run.
+        ``comparisons``: each pair of policies on the episodes of a source that both ran, see ``compare``.
+        ``common``: source to the number of episodes that all policies ran, out of the policies that ran the source.
         ``failures``: episodes to show, and whether there is a video.
     """
     present = {row.source for policy in policies for row in policy.rows}
     sources = [*(source for source in SOURCES if source in present), *sorted(present.difference(SOURCES))]
-    tested = {policy.name: rows for policy in policies if (rows := policy.of("libero_plus"))}
+    tested = {policy.name: policy.of("libero_plus") for policy in policies if policy.of("libero_plus")}
     return {
-        "policies": {
-            policy.name: {
-                "settings": policy.settings,
-                "versions": _versions(policy.rows),
-                "refused": policy.refused,
-                "overall": success_rate(policy.rows),
-                "results": {source: summary(rows) for source in sources if (rows := policy.of(source))},
-            }
-            for policy in policies
-        },
-        "common": {
-            source: len(
-                set.intersection(*({row.trial for row in rows} for one in policies if (rows := one.of(source))))
-            )
-            for source in sources
-        },
+        "policies": {policy.name: _policy_findings(policy, sources) for policy in policies},
+        "common": {source: _common_trials(policies, source) for source in sources},
         "paper_table": paper_table(tested) if tested else None,
-        "comparisons": [
-            {"source": source, "first": one.name, "second": other.name, **compare(pairs)}
-            for source in sources
-            for one, other in combinations(policies, 2)
-            if (pairs := paired(one.of(source), other.of(source)))
-        ],
-        "failures": [
-            {
-                "policy": policy.name,
-                "video": row.episode in policy.videos,
-                **{name: getattr(row, name) for name in _FACTS},
-            }
-            for policy in policies
-            for row in _shown_failures(policy)
-        ],
+        "comparisons": _comparisons(policies, sources),
+        "failures": _failures(policies),
     }
 
 
+def _policy_findings(policy: Evaluated, sources: Sequence[str]) -> dict[str, Any]:
+    results = {}
+    overall = success_rate(policy.rows)
+    for source in sources:
+        rows = policy.of(source)
+        if rows:
+            results[source] = summary(rows)
+    return {
+        "settings": policy.settings,
+        "versions": _versions(policy.rows),
+        "refused": policy.refused,
+        "overall": overall,
+        "results": results,
+    }
+
+
+def _common_trials(policies: Sequence[Evaluated], source: str) -> int:
+    """Count the trials of a source that all policies ran, out of the policies that ran any trial of it."""
+    trials = []
+    for policy in policies:
+        rows = policy.of(source)
+        if rows:
+            trials.append({row.trial for row in rows})
+    return len(set.intersection(*trials))
+
+
+def _comparisons(policies: Sequence[Evaluated], sources: Sequence[str]) -> list[dict[str, Any]]:
+    comparisons = []
+    for source in sources:
+        for first, second in combinations(policies, 2):
+            pairs = paired(first.of(source), second.of(source))
+            if pairs:
+                comparisons.append({"source": source, "first": first.name, "second": second.name, **compare(pairs)})
+    return comparisons
+
+
+def _failures(policies: Sequence[Evaluated]) -> list[dict[str, Any]]:
+    failures = []
+    for policy in policies:
+        for row in _shown_failures(policy):
+            facts = {name: getattr(row, name) for name in _FACTS}
+            failures.append({"policy": policy.name, "video": row.episode in policy.videos, **facts})
+    return failures
+
+
 def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
-    """Of each source and axis those with a video first, then the weakest perturbations, then by name."""
+    """Choose failures of each source and axis: with a video first, then by level from the weakest, then by name."""
     failed = [row for row in policy.rows if not row.success]
     failed.sort(key=lambda row: (row.axis, row.episode not in policy.videos, row.level, row.episode))
     groups = grouped(((row.axis, row.source), row) for row in failed)
@@ -85,7 +103,10 @@ def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
 
 def _versions(rows: Sequence[EpisodeResult]) -> dict[str, list[str]]:
     names = dict.fromkeys(name for row in rows for name in row.versions if name not in PER_TASK)
-    return {name: sorted({row.versions[name] for row in rows if name in row.versions}) for name in names}
+    versions = {}
+    for name in names:
+        versions[name] = sorted({row.versions[name] for row in rows if name in row.versions})
+    return versions
 
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
@@ -95,7 +116,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {**{axis: (axis,) for axis in _SAME}, "lay
 """The paper's dimensions to this project's axes."""
 
 NAMES = {("layout", "objects"): "confounding objects", ("pose", "pose"): "displaced targets"}
-"""What the paper calls the two components of its layout."""
+"""Names of the paper for the two components of its layout."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +127,7 @@ class Estimate:
         rate: in [0, 1].
         effective: the number of equally weighted episodes that would be as informative (Kish, 1965).
         low, high: Wilson's 95 % interval for that number (Korn and Graubard, 1998).
-        absent: what of the benchmark no episode stands for.
+        absent: the parts of the benchmark that no episode stands for.
     """
 
     episodes: int
@@ -118,48 +139,66 @@ class Estimate:
 
 
 def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
-    """The paper's table, policies beside the published models; JSON-serialisable.
+    """Compute the paper's table, with policies next to the published models; JSON-serialisable.
 
-    An evaluation on a balanced subset has as many easy tasks as hard ones, and the benchmark has not. So an episode
-    stands for as many test tasks as there are of its axis, component and level for each one that was run. What no
-    episode was run of is left out of a column, and said.
+    A balanced subset has as many easy tasks as hard tasks, but the benchmark has not. An episode is therefore weighted
+    by the number of test tasks of its axis, component and level, divided by the number of its episodes. Parts of the
+    benchmark without an episode are left out of a column, and reported.
 
     Args:
         policies: name to episodes on test tasks.
 
     Returns:
-        ``source``: of the published rows.
+        ``source``: reference of the published rows.
         ``tasks``: column to the number of test tasks in it.
         ``shared``: the columns that every evaluated policy was measured on.
-        ``evaluated``: rows with ``name``, ``cells``, which are column to an ``Estimate`` where it was measured,
-        ``total`` over all columns, weighted by their numbers of tasks, None where one was not measured, and ``shared``,
-        the same over the shared columns.
+        ``evaluated``: rows with ``name``, ``cells``, ``total`` and ``shared``. ``cells`` map each measured column to an
+        ``Estimate``. ``total`` is over all columns, weighted by their numbers of tasks; it is `None` if a column was
+        not measured. ``shared`` is the total over the shared columns.
         ``published``: rows with ``name``, ``rates`` by column in percent, ``total``, and ``shared``, which is not in
         the paper.
     """
     tasks = {column: _sizes(axes, 1).total() for column, axes in COLUMNS.items()}
-    cells = {
-        name: {column: cell for column, axes in COLUMNS.items() if (cell := _cell(rows, axes))}
-        for name, rows in policies.items()
-    }
-    shared = [column for column in COLUMNS if all(column in measured for measured in cells.values())]
-    evaluated = [
-        {
-            "name": name,
-            "cells": {column: asdict(cell) for column, cell in measured.items()},
-            "total": asdict(_joined(measured, tasks)) if len(measured) == len(COLUMNS) else None,
-            "shared": asdict(_joined({column: measured[column] for column in shared}, tasks)) if shared else None,
-        }
-        for name, measured in cells.items()
-    ]
+    measured = {name: _cells(rows) for name, rows in policies.items()}
+    shared = set(COLUMNS).intersection(*measured.values())
+    shared_columns = [column for column in COLUMNS if column in shared]
+    evaluated = [_evaluated_row(name, cells, shared_columns, tasks) for name, cells in measured.items()]
     packed = yaml.safe_load(PUBLISHED.read_text())
     published = []
     for name, row in packed["models"].items():
         rates = dict(zip(packed["columns"], row["rates"], strict=True))
-        mean = _mean({column: rates[column] for column in shared}, tasks) if shared else None
+        mean = _mean({column: rates[column] for column in shared_columns}, tasks) if shared_columns else None
         published.append({"name": name, "rates": rates, "total": row["total"], "shared": mean})
-    found = {"source": packed["source"], "tasks": tasks, "shared": shared}
-    return {**found, "published": published, "evaluated": evaluated}
+    return {
+        "source": packed["source"],
+        "tasks": tasks,
+        "shared": shared_columns,
+        "published": published,
+        "evaluated": evaluated,
+    }
+
+
+def _evaluated_row(
+    name: str, cells: Mapping[str, Estimate], shared: Sequence[str], tasks: Mapping[str, int]
+) -> dict[str, Any]:
+    total = _joined(cells, tasks) if len(cells) == len(COLUMNS) else None
+    over_shared = _joined({column: cells[column] for column in shared}, tasks) if shared else None
+    return {
+        "name": name,
+        "cells": {column: asdict(cell) for column, cell in cells.items()},
+        "total": None if total is None else asdict(total),
+        "shared": None if over_shared is None else asdict(over_shared),
+    }
+
+
+def _cells(rows: Sequence[EpisodeResult]) -> dict[str, Estimate]:
+    """Estimate the success rate in each column that has episodes."""
+    cells = {}
+    for column, axes in COLUMNS.items():
+        cell = _cell(rows, axes)
+        if cell is not None:
+            cells[column] = cell
+    return cells
 
 
 def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None:
@@ -167,15 +206,15 @@ def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None
     outcomes = grouped((_stratum(row), row.success) for row in chosen)
     if not outcomes:
         return None
-    strata = {
-        stratum: Estimate(len(listed), sum(listed) / len(listed), len(listed), 0, 1)
-        for stratum, listed in outcomes.items()
-    }
+    strata = {}
+    for stratum, successes in outcomes.items():
+        number = len(successes)
+        strata[stratum] = Estimate(number, sum(successes) / number, number, 0, 1)
     return replace(_joined(strata, _sizes(axes, 3)), absent=_absent(chosen, axes))
 
 
 def _stratum(row: EpisodeResult) -> tuple[str, str, int]:
-    """Axis, component and level; a result of an earlier version may state another level."""
+    """Return axis, component and level from the benchmark: a result of an earlier version may have another level."""
     return row.axis, row.component, level_of_test(benchmark.load().find(row.suite, row.name))
 
 
@@ -194,18 +233,19 @@ def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
 def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
     run, sizes = {_stratum(row) for row in rows}, _sizes(axes, 3)
     missing = grouped((stratum[:2], stratum[2]) for stratum in sorted(sizes.keys() - run))
-    told = []
+    descriptions = []
     for kind, levels in missing.items():
         partly = any(stratum[:2] == kind for stratum in run)
         which = f" level {' and '.join(map(str, levels))}" if partly else ""
         count = sum(sizes[(*kind, level)] for level in levels)
-        told.append(f"{NAMES.get(kind, kind[1])}{which} ({count:,} tasks)")
-    suites = {suite for axis, _, _, suite in _tests() if axis in {axis for axis, *_ in run}}
-    return ", ".join([*told, *sorted(suites - {row.suite for row in rows})])
+        descriptions.append(f"{NAMES.get(kind, kind[1])}{which} ({count:,} tasks)")
+    axes_run = {axis for axis, *_ in run}
+    suites = {suite for axis, _, _, suite in _tests() if axis in axes_run}
+    return ", ".join([*descriptions, *sorted(suites - {row.suite for row in rows})])
 
 
 def _sizes(axes: Sequence[str], columns: int) -> Counter[Any]:
-    """How many test tasks of some axes there are, by the first columns of ``_tests``."""
+    """Count the test tasks of some axes by the first columns of ``_tests``."""
     sizes: Counter[Any] = Counter()
     for kind, count in _tests().items():
         if kind[0] in axes:

@@ -1,4 +1,4 @@
-"""The report of evaluations: one HTML page in need of nothing beside itself, and what it says as JSON."""
+"""The report of evaluations: one self-contained HTML page, and its content as JSON."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -19,7 +19,7 @@ TITLES = {
     "goals": "Other goals in LIBERO's scenes",
     "libero": "LIBERO's tasks, unperturbed",
 }
-"""Of sources of tasks; others have their own names as titles."""
+"""Titles of sources of tasks; other sources have their own names as titles."""
 
 GROUPINGS = {
     "by_axis": "by axis",
@@ -28,44 +28,46 @@ GROUPINGS = {
     "by_suite": "by suite",
 }
 CLOSER = {"by_axis_and_level": "by axis and level", "by_suite_and_axis": "by suite and axis"}
-"""Groupings of ``summary`` to their titles; those of ``CLOSER`` are folded away and not plotted."""
+"""Groupings of ``summary`` to their titles; the groupings of ``CLOSER`` are collapsed on the page and not plotted."""
 
 
 WIDE = 0.2
-"""A rate whose interval is wider is not set beside published ones: the interval stands in its place."""
+"""Width of an interval above which the page shows the interval, not the rate, next to published rates."""
 
 
 def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
-    """Write the page, and its findings beside it.
+    """Write the page, and its findings next to it.
 
     Returns:
-        Where they are, and each policy's rate by source.
+        The paths of both files, and each policy's rate by source.
 
     Raises:
-        PipelineError: when ``path`` is not the name of an HTML file, or one of the two is another file.
+        PipelineError: when ``path`` is not the name of an HTML file, or would overwrite a file of another origin.
     """
     if path.suffix != ".html":
         raise PipelineError("not the name of a page", where=path, expected="a name that ends in .html")
-    beside = path.with_suffix(".json")
+    json_path = path.with_suffix(".json")
     files.refuse_other_file(path, "<title>Evaluation: ")
-    files.refuse_other_file(beside, '"paper_table": ')
+    files.refuse_other_file(json_path, '"paper_table": ')
     found = findings(policies)
-    files.write(path, page(found, {episode: file for policy in policies for episode, file in policy.videos.items()}))
-    files.write_json(beside, found)
-    rates = {
-        name: {source: one["all"] for source, one in policy["results"].items()}
-        for name, policy in found["policies"].items()
-    }
-    return {"page": str(path), "findings": str(beside), "rates": rates}
+    videos = {episode: file for policy in policies for episode, file in policy.videos.items()}
+    files.write(path, page(found, videos))
+    files.write_json(json_path, found)
+    rates = {}
+    for name, policy in found["policies"].items():
+        rates[name] = {source: summary["all"] for source, summary in policy["results"].items()}
+    return {"page": str(path), "findings": str(json_path), "rates": rates}
 
 
 def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
-    """The page.
+    """Render the page.
 
     Args:
-        videos: by the name of the episode.
+        found: the findings.
+        videos: name of an episode to its video.
     """
     colours = dict(zip(found["policies"], cycle(figures.COLOURS.values()), strict=False))
+    filmed = [failure["episode"] for failure in found["failures"] if failure["video"]]
     return pages.render(
         "evaluation_report.html.j2",
         found=found,
@@ -79,23 +81,24 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
         sections={source: _section(source, found, colours) for source in found["common"]},
         groupings=GROUPINGS,
         closer=CLOSER,
-        videos={one["episode"]: pages.video_of(videos[one["episode"]]) for one in found["failures"] if one["video"]},
+        videos={episode: pages.video_of(videos[episode]) for episode in filmed},
         limit=FAILURES,
         titles=TITLES,
     )
 
 
 def _differ(found: Mapping[str, Any]) -> bool:
-    policies = found["policies"].values()
-    return any(
-        policy["results"].get(source, {"all": {"episodes": 0}})["all"]["episodes"] != common
-        for source, common in found["common"].items()
-        for policy in policies
-    )
+    """Return whether a policy's number of episodes of a source differs from the number that all policies ran."""
+    none = {"all": {"episodes": 0}}
+    for source, common in found["common"].items():
+        for policy in found["policies"].values():
+            if policy["results"].get(source, none)["all"]["episodes"] != common:
+                return True
+    return False
 
 
 def _points(tasks: Mapping[str, int]) -> tuple[float, float]:
-    """How wide intervals of published rates are at most, in points: of the total, and of the smallest column."""
+    """Return the largest widths, in points, of published rates' intervals: total, and smallest column."""
 
     def widest(count: int) -> float:
         low, high = wilson(count / 2, count)
@@ -105,27 +108,27 @@ def _points(tasks: Mapping[str, int]) -> tuple[float, float]:
 
 
 def _section(source: str, found: Mapping[str, Any], colours: Mapping[str, str]) -> dict[str, Any]:
-    """Of the tasks of one source: policy to ``results``, the names in ``groups``, plots, and ``comparisons``."""
-    results = {
-        name: policy["results"][source] for name, policy in found["policies"].items() if source in policy["results"]
-    }
-    groups = {
-        grouping: sorted({name for one in results.values() for name in one[grouping]})
-        for grouping in (*GROUPINGS, *CLOSER)
-    }
+    """Collect the section of one source: policy to ``results``, the ``groups``, ``panels``, and ``comparisons``."""
+    results = {}
+    for name, policy in found["policies"].items():
+        if source in policy["results"]:
+            results[name] = policy["results"][source]
+    groups = {}
+    for grouping in (*GROUPINGS, *CLOSER):
+        groups[grouping] = sorted({name for summary in results.values() for name in summary[grouping]})
 
     def plot(grouping: str, title: str) -> Panel:
         rows: dict[str, list[Share]] = {name: [] for name in groups[grouping]}
-        for policy, one in results.items():
-            for name, group in one[grouping].items():
+        for policy, summary in results.items():
+            for name, group in summary[grouping].items():
                 rows[name].append(Share(group["rate"], group["low"], group["high"], colours[policy]))
         return figures.intervals(title, rows, "success rate")
 
-    # Where a grouping has one group, it repeats the whole, which stands at the top of the page.
+    # A grouping with a single group repeats the whole, which the top of the page shows.
     several = {grouping: names for grouping, names in groups.items() if len(names) > 1}
     return {
         "results": results,
         "groups": several,
         "panels": [plot(grouping, title) for grouping, title in GROUPINGS.items() if grouping in several],
-        "comparisons": [one for one in found["comparisons"] if one["source"] == source],
+        "comparisons": [comparison for comparison in found["comparisons"] if comparison["source"] == source],
     }

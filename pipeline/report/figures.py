@@ -1,7 +1,7 @@
 """Small plots as inline SVG: one panel each, as wide as a phone's screen, in the colour of the page's text.
 
-A page lays panels out as its width allows. Text stays text, and whatever is plotted in ``INK`` takes the page's own
-colour, so that one figure reads in light and in dark.
+A page arranges panels as its width allows. Text stays text. Everything plotted in ``INK`` takes the colour of the
+page's text, so that a figure can be read on light and on dark pages.
 """
 
 import io
@@ -21,18 +21,18 @@ from pipeline.axes import AXES
 
 Values = NDArray[Any]
 Groups = Mapping[str, Values]
-"""What is plotted in one colour, by name; those of ``REFERENCES`` are plotted behind the others, in grey."""
+"""Values plotted in one colour, by name; groups in ``REFERENCES`` are plotted behind the others, in grey."""
 
 REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
 PALETTE = ("#7d9a1f", "#d463b0", "#129fc0", "#6b7d94", "#4285f4", "#e59a00", "#1f9e82", "#9467d6", "#e4572e", "#a3384d")
-"""In the order of ``Axes``; what comes with a new axis is put in at its place, so that others keep their colours."""
+"""Colours in the order of ``Axes``; a new axis gets a new colour at its position, so that other axes keep theirs."""
 COLOURS = dict(zip(AXES, PALETTE, strict=False))
 OTHER = "#b0794a"
-"""For episodes that are perturbed on several axes, and where axes are more than colours."""
+"""Colour of episodes that are perturbed on several axes, and of axes beyond the number of colours."""
 
 INK = "#010203"
-"""A colour that nothing else has; it becomes the page's."""
+"""A colour that nothing else has; the page's text colour replaces it."""
 
 STYLE: Any = {
     "font.size": 9,
@@ -50,10 +50,10 @@ STYLE: Any = {
 }
 WIDTH_IN, HEIGHT_IN = 3.4, 2.3
 SMALLEST_SHARE = 1e-4
-"""Where a logarithmic scale of shares begins, the same in all figures."""
+"""Lower limit of a logarithmic scale of shares, in all figures."""
 
 DOTS_DPI = 220
-"""Clouds of points are pictures within the SVG: a thousand circles would be a hundred times the bytes."""
+"""Resolution of point clouds, which are pictures within the SVG: a thousand circles would take 100 times the bytes."""
 
 
 class Panel(NamedTuple):
@@ -66,14 +66,14 @@ def colour(group: str) -> str:
 
 
 def panel(title: str, plot: Callable[[Axes], None], height_in: float = HEIGHT_IN) -> Panel:
-    """One pair of axes, plotted on by ``plot``."""
+    """Render one pair of axes, on which ``plot`` plots."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained", dpi=DOTS_DPI)
         plot(figure.add_subplot())
         written = io.StringIO()
-        # Without a date the same data give the same bytes.
+        # Without a date, equal data give equal bytes.
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        # As savefig does, which plots everything once more before.
+        # The same call as in savefig, which would plot everything once more before.
         FigureCanvasSVG(figure).print_svg(written, metadata=nothing)  # type: ignore[no-untyped-call]
     plotted = written.getvalue()
     plotted = plotted[plotted.index("<svg") :].replace(INK, "currentColor")
@@ -83,7 +83,10 @@ def panel(title: str, plot: Callable[[Axes], None], height_in: float = HEIGHT_IN
 
 
 def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = False) -> Panel:
-    """Share of each group's values in each bin: references filled, the others as lines; empty groups are left out."""
+    """Plot the share of each group's values in each bin: references filled, other groups as lines.
+
+    Empty groups are left out.
+    """
 
     def plot(axes: Axes) -> None:
         for name, values in _references_first(groups):
@@ -99,15 +102,15 @@ def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = 
         axes.set(xlabel=label, ylabel="share", xlim=(bins[0] - margin, bins[-1] + margin))
         if log:
             axes.set(yscale="log", ylim=(SMALLEST_SHARE, 1.2))
-            # Left to itself, Matplotlib sets powers of ten as formulas, and eight ticks between two, which takes longer
-            # than all else.
+            # By default, Matplotlib formats powers of ten as formulas, with eight ticks between two of them, which
+            # takes longer than all other plotting.
             axes.yaxis.set(major_formatter="{x:g}", minor_locator=NullLocator())
 
     return panel(title, plot)
 
 
 def scatter(title: str, groups: Groups, x_label: str, y_label: str, equal: bool = False) -> Panel:
-    """Points (N, 2) in a plane; ``equal`` keeps both scales the same."""
+    """Plot points (N, 2) in a plane; ``equal`` keeps both scales equal."""
 
     def plot(axes: Axes) -> None:
         for name, points in _references_first(groups):
@@ -121,14 +124,14 @@ def scatter(title: str, groups: Groups, x_label: str, y_label: str, equal: bool 
 
 
 def _dots(axes: Axes, x: Values, y: Values, group: str, behind: bool) -> None:
-    # Of many points the density should be visible.
+    # Many points are more transparent, so that their density is visible.
     opacity = (0.4 if behind else 0.85) * min(1.0, max(0.1, 500 / max(1, len(x))))
     size_pt2 = 9 if behind else 15
     axes.scatter(x, y, s=size_pt2, color=colour(group), alpha=opacity, linewidths=0, rasterized=True)
 
 
 def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
-    """A line for each row with its groups' values along it, references below what is compared with them."""
+    """Plot a line for each row, with its groups' values along it and references below the other groups."""
 
     def plot(axes: Axes) -> None:
         for height, groups in enumerate(rows.values()):
@@ -136,11 +139,11 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
                 alone = len(groups) == 1
                 behind = name in REFERENCES and not alone
                 middle = height + (0.0 if alone else 0.2 if behind else -0.2)
-                # Equal values are plotted beside each other.
+                # Equal values are plotted next to each other.
                 ordered = np.sort(values)
                 spread = 0.16 * np.sin(2.4 * (np.arange(len(ordered)) - np.searchsorted(ordered, ordered)))
                 _dots(axes, ordered, middle + spread, name, behind)
-        # A combination's name may break behind a +.
+        # A combination's name may wrap after a +.
         axes.set_yticks(range(len(rows)), [name.replace("+", "+\n") for name in rows])
         axes.set(xlabel=label, ylim=(len(rows) - 0.5, -0.5))
         axes.grid(visible=False, axis="y")
@@ -149,7 +152,7 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
             MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((plotted == plotted.round()).all()))
         )
         if len(plotted) and np.isclose(plotted.min(), plotted.max()):
-            # A scale around one single value would show thousandths.
+            # A default scale around a single value would show thousandths.
             axes.set_xlim(plotted[0] - 1, plotted[0] + 1)
 
     lines = max(1 + name.count("+") for name in rows)
@@ -157,7 +160,7 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
 
 
 def bars(title: str, counts: Mapping[str, int], group: str, label: str) -> Panel:
-    """A bar for each name, largest first."""
+    """Plot a bar for each name, largest first."""
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
     def plot(axes: Axes) -> None:
@@ -172,7 +175,7 @@ def bars(title: str, counts: Mapping[str, int], group: str, label: str) -> Panel
 
 
 class Share(NamedTuple):
-    """A share in [0, 1] with its interval, and the colour that it is plotted in."""
+    """A share in [0, 1] with its interval, and its colour in plots."""
 
     share: float
     low: float
@@ -181,15 +184,15 @@ class Share(NamedTuple):
 
 
 def intervals(title: str, rows: Mapping[str, Sequence[Share]], label: str) -> Panel:
-    """A line for each row with its shares and their intervals, below each other."""
+    """Plot a line for each row, with its shares and their intervals below each other."""
     most = max(map(len, rows.values()))
 
     def plot(axes: Axes) -> None:
         for height, shares in enumerate(rows.values()):
-            for place, shown in enumerate(shares):
+            for place, share in enumerate(shares):
                 at = height + 0.6 * ((place + 0.5) / most - 0.5)
-                axes.plot([shown.low, shown.high], [at, at], color=shown.colour, linewidth=1.6, solid_capstyle="butt")
-                axes.plot([shown.share], [at], "o", color=shown.colour, markersize=4.5)
+                axes.plot([share.low, share.high], [at, at], color=share.colour, linewidth=1.6, solid_capstyle="butt")
+                axes.plot([share.share], [at], "o", color=share.colour, markersize=4.5)
         axes.set_yticks(range(len(rows)), [name.replace("_", " ") for name in rows])
         axes.set(xlabel=label, xlim=(-0.02, 1.02), ylim=(len(rows) - 0.5, -0.5))
         axes.grid(visible=False, axis="y")

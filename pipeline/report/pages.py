@@ -1,4 +1,4 @@
-"""HTML pages from ``templates/``, that need nothing beside themselves: pictures and videos are ``data:`` addresses."""
+"""Self-contained HTML pages from ``templates/``: pictures and videos are ``data:`` addresses."""
 
 import base64
 import io
@@ -18,11 +18,11 @@ from pipeline.report.sheets import MOMENT
 from pipeline.types import Frame
 
 PICTURE_PX, PICTURE_QUALITY = 1100, 80
-"""At most this wide: captions of a contact sheet can still be read."""
+"""Largest width of a picture, at which captions of a contact sheet can be read, and its JPEG quality."""
 
 
 def render(template: str, **values: Any) -> str:
-    """A page; names that ``values`` lacks are an error, and what they hold is escaped."""
+    """Render a page; values are escaped, and a name without a value is an error."""
     environment = Environment(
         loader=PackageLoader("pipeline.report"),
         autoescape=True,
@@ -36,39 +36,48 @@ def render(template: str, **values: Any) -> str:
 
 
 def counted(number: int, one: str, several: str = "") -> str:
-    """Such as ``1 episode`` and ``10,030 episodes``; ``several`` where it is not ``one`` with an s."""
+    """Format a number with a noun, such as ``1 episode`` or ``10,030 episodes``.
+
+    Args:
+        number: the number.
+        one: the noun in the singular.
+        several: the noun in the plural, if it is not ``one`` with an s.
+    """
     return f"{number:,} {one if number == 1 else several or f'{one}s'}"
 
 
 class Clip(NamedTuple):
-    """A video and the picture that stands for it, both as ``data:`` addresses."""
+    """A video and its poster picture, both as ``data:`` addresses."""
 
     video: str
     poster: str
 
 
 def picture(image: Image.Image) -> str:
-    """A JPEG of an image."""
-    shown = image.convert("RGB")
-    shown.thumbnail((PICTURE_PX, shown.height), Image.Resampling.LANCZOS)
+    """Encode an image as the address of a JPEG."""
+    scaled = image.convert("RGB")
+    scaled.thumbnail((PICTURE_PX, scaled.height), Image.Resampling.LANCZOS)
     packed = io.BytesIO()
-    shown.save(packed, "jpeg", quality=PICTURE_QUALITY, optimize=True)
+    scaled.save(packed, "jpeg", quality=PICTURE_QUALITY, optimize=True)
     return _address("image/jpeg", packed.getvalue())
 
 
 def beside(twin: Sequence[bytes], episode: Sequence[bytes]) -> Clip:
-    """Two episodes' stored frames side by side, in real time; the shorter one waits at its last frame."""
-    shown: list[Frame] = []
+    """Show two episodes' stored frames side by side, in real time; the shorter episode stays at its last frame."""
+    frames: list[Frame] = []
     left = right = decode(twin[0])
-    for one, other in zip_longest(map(decode, twin), map(decode, episode)):
-        left, right = left if one is None else one, right if other is None else other
-        shown.append(np.concatenate([left, right], axis=1))
-    poster = Image.fromarray(shown[int(MOMENT * len(shown))])
-    return Clip(_address("video/mp4", mp4(shown, range(len(shown)))), picture(poster))
+    for twin_frame, frame in zip_longest(map(decode, twin), map(decode, episode)):
+        if twin_frame is not None:
+            left = twin_frame
+        if frame is not None:
+            right = frame
+        frames.append(np.concatenate([left, right], axis=1))
+    poster = Image.fromarray(frames[int(MOMENT * len(frames))])
+    return Clip(_address("video/mp4", mp4(frames, range(len(frames)))), picture(poster))
 
 
 def video_of(file: Path) -> str:
-    """A video file as it is."""
+    """Return the address of a video file, whose bytes stay unchanged."""
     return _address("video/mp4", file.read_bytes())
 
 

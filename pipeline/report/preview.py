@@ -1,7 +1,7 @@
-"""Preview: what the axes do to a task, as a contact sheet in the manner of the paper's appendix.
+"""Preview: the effect of each axis on a task, as a contact sheet in the manner of the paper's appendix.
 
-Every picture shows the demonstration's first state, without a replay; of a push, the replay that it acts in. The draws
-are those that a plan with the same seed makes for the demonstration.
+Every picture shows the demonstration's first state, without a replay; a push is shown in its replay. The perturbations
+are the ones that a plan with the same seed samples for the demonstration.
 """
 
 from collections.abc import Iterable, Sequence
@@ -37,11 +37,11 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task, Trajectory
 
 VARIANTS, PHYSICS_VARIANTS = 11, 3
-"""With the original, three rows of four; one where each variant is a scene of its own to compile."""
+"""With the original, three rows of four; one row of four if each variant is a separate scene to compile."""
 STRIP_STEPS = (0, 6, 16)
-"""Control steps after the end of a push that a strip shows, beside where it begins."""
+"""Control steps after the end of a push that a strip shows, in addition to its first step."""
 CANDIDATES = 200
-"""The plan's first draws, from which the variants are chosen; most draws take well under a millisecond."""
+"""Number of the plan's first perturbations, from which the variants are chosen; most take well under a millisecond."""
 
 SIDE_PX = {1: 256, 2: 192}
 """Width of a frame, by how many views a tile shows."""
@@ -50,10 +50,10 @@ REFUSED_GREY = (160, 160, 160)
 
 @dataclass
 class Stage:
-    """A task set up to be looked at.
+    """A task set up for rendering.
 
     Attributes:
-        replay: how a run settles, and treats the demonstration's no-ops.
+        replay: settings of a run: settling, and treatment of the demonstration's no-ops.
     """
 
     demo: Demo
@@ -62,17 +62,18 @@ class Stage:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
     def frames(self, views: Sequence[str], perturbation: Perturbation | None = None) -> list[Frame]:
-        """What the views show, (H, W, 3) each, as a policy sees them.
+        """Render the views, (H, W, 3) each, as a policy sees them.
 
         Raises:
-            RefusedError: when the perturbation cannot be made in this scene.
+            RefusedError: when the perturbation is impossible in this scene.
         """
         changes = () if perturbation is None else (perturbation,)
         scene = self.scene
         for physics in of_layer(changes, PhysicsPerturbation):
             scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
-        if (push := scene.push) is None:
+        push = scene.push
+        if push is None:
             state = first_look(scene, self.demo.task, self.replay)
         else:
             state = roll_out(scene, self.demo, self.replay)[push.first_step + push.steps]
@@ -83,10 +84,10 @@ class Stage:
         return replay(shared(self.demo.task), self.demo, "twin", self.replay)
 
     def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
-        """Steps of a pushed replay, and the agent view at each, without the push and with it.
+        """Render the agent view at some steps of a pushed replay, each without the push and with it.
 
         Raises:
-            RefusedError: when the demonstration refuses the push, or does not reach its goal without one.
+            RefusedError: when the push is impossible in the demonstration, or its replay without one misses the goal.
         """
         twin = self._twin
         if not twin.verdict.kept:
@@ -94,26 +95,28 @@ class Stage:
         reference = Reference.of(twin.model_xml, twin.states, twin.actions)
         changes = of_layer((perturbation,), PhysicsPerturbation)
         pushed = replay(shared(self.demo.task), self.demo, "pushed", self.replay, changes, lambda: reference)
-        if (push := pushed.scene.push) is None:
+        push = pushed.scene.push
+        if push is None:
             raise RefusedError(pushed.verdict.reason)
         renderer, stream = self.opened.renderer(pushed.model_xml), Stream("image", ())
-        shown = []
-        for step in (push.first_step, *(push.first_step + push.steps + after for after in STRIP_STEPS)):
+        end = push.first_step + push.steps
+        steps_and_frames = []
+        for step in (push.first_step, *(end + after for after in STRIP_STEPS)):
             frames: list[Frame] = []
-            for one in (twin, pushed):
-                at = min(step, len(one.actions))
-                frames += frames_of(renderer, one.states[at], one.site_alpha[at], [stream], at)
-            shown.append((step, frames))
-        return shown
+            for trajectory in (twin, pushed):
+                at = min(step, len(trajectory.actions))
+                frames += frames_of(renderer, trajectory.states[at], trajectory.site_alpha[at], [stream], at)
+            steps_and_frames.append((step, frames))
+        return steps_and_frames
 
 
 def staged(tasks: Iterable[Task], config: Config) -> Stage:
     """Set up the first demonstration that the configured source has of any of the tasks.
 
-    Its scenes are rendered where this process renders; whoever is done closes it (``scene_of_process``).
+    Its scenes are rendered in the scene of this process, which the caller closes at the end (``scene_of_process``).
 
     Raises:
-        PipelineError: when the source has no usable one.
+        PipelineError: when the source has no usable demonstration.
     """
     source = config.demos.open()
     problems: list[Problem] = []
@@ -138,17 +141,18 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
 
 
 def configured(name: str, config: Config) -> Axis:
-    """The axis with the ranges of the configuration, or with its default ranges where the configuration has none."""
+    """Return the axis with the ranges of the configuration, or else with its default ranges."""
     return config.plan.axes.drawn().get(name) or AXES[name]()
 
 
 def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> list[Perturbation]:
-    """Draws of the plan's that cover the axis's components, and within each component its levels.
+    """Choose perturbations of the plan that cover the axis's components, and the levels of each component.
 
-    Empty if none of the axis's draws keeps clear of the test set.
+    The list is empty if no perturbation keeps the clearance to the test set.
 
     Raises:
-        PipelineError: when the axis has nothing to change in the task, or a level has no draw that keeps clear.
+        PipelineError: when the axis has nothing to change in the task, or no perturbation of a level keeps the
+            clearance.
     """
     if not axis.applies(demo.task):
         what = f"the axis {name} has nothing to change in {demo.task}"
@@ -160,7 +164,7 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
     count = PHYSICS_VARIANTS if of_layer(left, PhysicsPerturbation) else VARIANTS
 
     def wish(candidate: Perturbation) -> tuple[int, int, int]:
-        """The smaller, the more a draw adds: a rare component, a level far from those shown of it, a rare level."""
+        """Rank a candidate: first rare components, then levels far from the chosen levels, then rare levels."""
         levels = [p.level for p in chosen if p.component == candidate.component]
         apart = min((abs(level - candidate.level) for level in levels), default=0)
         return len(levels), -apart, sum(p.level == candidate.level for p in chosen)
@@ -172,12 +176,12 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
 
 
 def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
-    """The sheet of one axis: the original top left, then the variants with what was drawn.
+    """Render the sheet of one axis: the original top left, then the variants with their parameters.
 
-    What a scene refuses is a grey tile with the reason.
+    A grey tile with the reason stands for a perturbation that is impossible in the scene.
 
     Args:
-        test: the benchmark's test tasks, which the plan's draws keep clear of.
+        test: the benchmark's test tasks, to which the plan's perturbations keep a clearance.
     """
     demo, seed = stage.demo, config.plan.seed
     drawn = variants(name, configured(name, config), demo, seed, test)
@@ -188,19 +192,19 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
     if not drawn:
         tiles.append(_nothing_drawn(name, tiles[0].picture.size))
-    if strips := [tile for push in drawn for tile in _strip(stage, push)]:
+    strips = [tile for push in drawn for tile in _strip(stage, push)]
+    if strips:
         tiles, drawn, views = strips, [], ["image"]
     for perturbation in drawn:
         caption = describe(perturbation)
         try:
-            # What changes words alone is not rendered anew.
+            # A perturbation of the words alone changes no frame.
             frames = stage.frames(views, perturbation) if perturbation.views else original
             tiles.append(Tile(side_by_side(frames, side), caption))
         except RefusedError as refused:
             tiles.append(_refused(refused, caption, tiles[0].picture.size))
-    return sheet(
-        f"{demo.demo_id}, {'replays' if strips else 'first state'}; axis {name}, seed {seed}; {', '.join(views)}", tiles
-    )
+    moment = "replays" if strips else "first state"
+    return sheet(f"{demo.demo_id}, {moment}; axis {name}, seed {seed}; {', '.join(views)}", tiles)
 
 
 def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
@@ -208,19 +212,19 @@ def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
         return []
     caption = f"without and with {describe(push)}"
     try:
-        shown = stage.strip(push)
+        steps_and_frames = stage.strip(push)
     except RefusedError as refused:
         return [_refused(refused, caption)]
-    return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in shown]
+    return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in steps_and_frames]
 
 
 def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
-    """One sheet of all axes: the agent view of the clean twin, then one draw of each axis that applies to the task.
+    """Render one sheet of all axes: the agent view of the clean twin, then one perturbation of each axis that applies.
 
-    Of an axis it shows the strongest of the plan's first draws that the scene does not refuse.
+    For each axis, it is the strongest of the plan's first perturbations that is possible in the scene.
 
     Args:
-        test: the benchmark's test tasks, which the plan's draws keep clear of.
+        test: the benchmark's test tasks, to which the plan's perturbations keep a clearance.
     """
     demo = stage.demo
     tiles = [Tile(Image.fromarray(stage.frames(["image"])[0]), f"clean twin: {demo.task.instruction}")]
@@ -256,9 +260,9 @@ def _refused(why: RefusedError, caption: str, size_px: tuple[int, int] = (SIDE_P
 
 
 def for_run(config: Config, folder: Path, workers: Workers) -> None:
-    """Show every configured axis that applies on the first task of each suite that the run is about.
+    """Write a sheet for every configured axis that applies, on the first task of each suite of the run.
 
-    A sheet is ``<folder>/<suite>/<axis>.png``.
+    The path of a sheet is ``<folder>/<suite>/<axis>.png``.
     """
     by_suite = grouped((task.suite, task) for task in select_tasks(config.demos.tasks))
     test = benchmark.load()
@@ -272,10 +276,11 @@ def for_run(config: Config, folder: Path, workers: Workers) -> None:
 
 def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     tasks, config, folder, test = job
-    # It is there where another worker was lost over these.
+    # The folder exists if another worker was lost while it rendered these sheets.
     folder.mkdir(parents=True, exist_ok=True)
     stage = staged(tasks, config)
-    # Deepest last: what adds objects opens a scene for each draw, after which the demonstration's would be opened anew.
+    # The deepest layer comes last: an axis that adds objects opens a scene for each perturbation, after which the
+    # demonstration's scene would have to be opened again.
     for name, axis in reversed(config.plan.axes.drawn().items()):
         if axis.applies(stage.demo.task):
             axis_sheet(stage, name, config, test).save(folder / f"{name}.png")

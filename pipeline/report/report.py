@@ -1,4 +1,4 @@
-"""The report of a run: one HTML page with its counts, plots, pictures and videos, that needs no other file."""
+"""The report of a run: one self-contained HTML page with its counts, plots, pictures and videos."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -38,14 +38,14 @@ ById = Mapping[str, Mapping[str, Any]]
 """Episode id to its row of the manifest."""
 
 REWRITES = 12
-"""So many are quoted."""
+"""Number of rewrites that are quoted."""
 
 WORST = 10
-"""So many episodes are shown that moved other objects farthest."""
+"""Number of episodes shown that moved other objects farthest."""
 
 
 class Video(NamedTuple):
-    """An episode beside its twin, and what was changed."""
+    """An episode next to its twin, and the perturbations."""
 
     axis: str
     caption: str
@@ -54,10 +54,10 @@ class Video(NamedTuple):
 
 
 def page(run: Run, test: TestSet) -> str:
-    """The report of a finished run.
+    """Render the report of a finished run.
 
     Raises:
-        PipelineError: when the run's folder lacks what an earlier stage makes.
+        PipelineError: when the run's folder lacks an output of an earlier stage.
     """
     rows, config = run.manifest, run.config
     load = run.episodes()
@@ -111,21 +111,23 @@ def _headline(tried: Rows, kept: Rows) -> dict[str, str]:
 
 
 def _actions(rows: Rows, frames: FrameStore) -> dict[str, Floats]:
-    """Episode id to its actions (T, 7); episodes of one trajectory share the array."""
-    read: dict[str, Floats] = {}
+    """Read the actions (T, 7) of each episode, by id; episodes of one trajectory share the array."""
+    of_trajectory: dict[str, Floats] = {}
     for row in rows:
-        if row["trajectory_id"] not in read:
-            read[row["trajectory_id"]] = frames.motion(row["trajectory_id"])[0].astype(np.float64)
-    return {row["episode_id"]: read[row["trajectory_id"]] for row in rows}
+        trajectory_id = row["trajectory_id"]
+        if trajectory_id not in of_trajectory:
+            of_trajectory[trajectory_id] = frames.motion(trajectory_id)[0].astype(np.float64)
+    return {row["episode_id"]: of_trajectory[row["trajectory_id"]] for row in rows}
 
 
 def _histograms(groups: Mapping[str, Floats]) -> list[Panel]:
     low, high = SCHEMA.action.range
     bins = np.linspace(low, high, 42)  # an odd number, so that zero has a bin of its own
-    return [
-        figures.histogram(name, {group: rows[:, entry] for group, rows in groups.items()}, bins, "action", log=True)
-        for entry, name in enumerate(SCHEMA.action.names)
-    ]
+    panels = []
+    for entry, name in enumerate(SCHEMA.action.names):
+        values = {group: rows[:, entry] for group, rows in groups.items()}
+        panels.append(figures.histogram(name, values, bins, "action", log=True))
+    return panels
 
 
 def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id") -> Floats:
@@ -133,26 +135,31 @@ def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id")
 
 
 def _own_motion(kept: Rows, twins: ById, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:
-    """Axis to its actions beside those of its episodes' twins, for axes with replays of their own."""
-    shown = {}
+    """Plot the actions of each axis next to the actions of the twins, for axes with replays of their own."""
+    panels = {}
     for axis, rows in by_axis(kept).items():
         paired = [row for row in rows if row["twin_id"] in twins]
         if any(row["trajectory_id"] != twins[row["twin_id"]]["trajectory_id"] for row in paired):
             clean = _stacked(paired, actions, "twin_id")
-            shown[axis] = _histograms({"clean": clean, axis: _stacked(paired, actions)})
-    return shown
+            panels[axis] = _histograms({"clean": clean, axis: _stacked(paired, actions)})
+    return panels
 
 
 def _strips(title: str, rows: Rows, of: Callable[[Mapping[str, Any]], float | None], label: str) -> Panel:
-    """A figure of each episode, by axis; those that have none are left out."""
-    values = {axis: [value for row in group if (value := of(row)) is not None] for axis, group in by_axis(rows).items()}
-    return figures.strips(title, {axis: {axis: np.array(own, float)} for axis, own in values.items()}, label)
+    """Plot a number of each episode, by axis; episodes without the number are left out."""
+    groups = {}
+    for axis, of_axis in by_axis(rows).items():
+        values = [of(row) for row in of_axis]
+        stated = [value for value in values if value is not None]
+        groups[axis] = {axis: np.array(stated, float)}
+    return figures.strips(title, groups, label)
 
 
 def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
-    suites = dict.fromkeys(row["suite"] for row in kept)
-    of_suites = {suite: [row for row in kept if row["suite"] == suite] for suite in suites}
-    panels = [_strips(suite, own, itemgetter("steps"), "steps") for suite, own in of_suites.items()]
+    panels = []
+    for suite in dict.fromkeys(row["suite"] for row in kept):
+        of_suite = [row for row in kept if row["suite"] == suite]
+        panels.append(_strips(suite, of_suite, itemgetter("steps"), "steps"))
     steps = {row["episode_id"]: row["steps"] for row in rows}
 
     def longer(row: Mapping[str, Any]) -> float | None:
@@ -163,30 +170,31 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
 
 
 def _worst(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
-    """The trajectories that moved an object farthest which the goal does not name, beside their clean twins."""
+    """Show the trajectories that moved an object outside the goal farthest, next to their clean twins."""
     clean = {row["trajectory_id"] for row in twins.values()}
     paired = [row for row in kept if row["twin_id"] in twins and row["trajectory_id"] not in clean]
-    moving = [row for row in {row["trajectory_id"]: row for row in paired}.values() if row["non_target_moved_m"]]
-    shown = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
-    return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in shown]
+    row_of_trajectory = {row["trajectory_id"]: row for row in paired}
+    moving = [row for row in row_of_trajectory.values() if row["non_target_moved_m"]]
+    worst = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
+    return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in worst]
 
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
-    shown = {}
+    plots_and_tables = {}
     changes = ((made.axis, (row, made)) for row in tried for made in from_json(row["perturbations"]))
     for axis, of_axis in grouped(changes).items():
         table = yields.by_level("kept of planned, by component", [row for row, _ in of_axis], axis)
-        draws = [
-            Draw(find_task(row["suite"], row["task"]), made, json.loads(row["resolved"]).get(axis))
-            for row, made in of_axis
-            if row["kept"]
-        ]
-        shown[axis] = coverage.of(axis, draws, test), table
-    return shown
+        draws = []
+        for row, made in of_axis:
+            if row["kept"]:
+                resolved = json.loads(row["resolved"]).get(axis)
+                draws.append(Draw(find_task(row["suite"], row["task"]), made, resolved))
+        plots_and_tables[axis] = coverage.of(axis, draws, test), table
+    return plots_and_tables
 
 
 def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
-    """Class and level, original wording and rewrite; spread over the classes."""
+    """Quote class and level, original wording and rewrite, taking turns among the classes."""
     quoted: dict[str, list[tuple[str, str, str]]] = {}
     for row in kept:
         for made in from_json(row["perturbations"]):
@@ -199,14 +207,18 @@ def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
 
 
 def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
-    """The strongest episode of each axis that shows it in the agent view, the shortest of several, beside its twin."""
+    """Show, for each axis, the strongest episode that changes the agent view, next to its twin.
+
+    Among equally strong episodes, the shortest is shown.
+    """
     videos = []
     for rows in by_axis(kept).values():
         paired = [row for row in rows if row["twin_id"] in twins]
-        seen = [row for row in paired if _agent_view(row) != _agent_view(twins[row["twin_id"]])]
-        if seen:
-            row = min(seen, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
-            videos.append(_video(row, load, "; ".join(describe(made) for made in from_json(row["perturbations"]))))
+        visible = [row for row in paired if _agent_view(row) != _agent_view(twins[row["twin_id"]])]
+        if visible:
+            row = min(visible, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
+            caption = "; ".join(describe(made) for made in from_json(row["perturbations"]))
+            videos.append(_video(row, load, caption))
     return videos
 
 
@@ -234,7 +246,7 @@ def _versions(rows: Rows) -> dict[str, str]:
 
 
 class _Settings(yaml.SafeDumper):
-    """Writes of an absolute path the last name alone, as the page is for everybody."""
+    """A YAML dumper that writes only the last name of an absolute path, because the page may be published."""
 
 
 _Settings.add_multi_representer(
@@ -243,6 +255,6 @@ _Settings.add_multi_representer(
 
 
 def _settings(config: Config) -> str:
-    # Where it is computed changes nothing, and would make the page differ.
+    # The place of computation changes no result, and would make the pages differ.
     chosen = config.model_dump(exclude_defaults=True, exclude={"compute", "folder"})
     return yaml.dump(chosen, Dumper=_Settings, sort_keys=False)

@@ -1,8 +1,8 @@
-"""What a policy sees: a run's kept episodes beside the benchmark's test tasks, axis by axis.
+"""Visible effects of perturbations: a run's kept episodes next to the benchmark's test tasks, axis by axis.
 
-Other measures compare parameters. Here it is centimetres of the hand, shares of a view, grey levels and words. What
-test tasks show is in ``pipeline/testset/seen.json``, which ``benchmarks/test_tasks_seen.py`` makes by running them, and
-in what the benchmark's files say of them.
+Other measures compare parameters. The measures here are centimetres of the hand, shares of a view, grey levels and
+words. The values of the test tasks come from ``pipeline/testset/seen.json``, which ``benchmarks/test_tasks_seen.py``
+generates by running them, and from the benchmark's files.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats
 
 CAMERA_SIDE_M = 0.19
-"""From where on, along x in the frame of the working surface, an object stands on the side of the agent camera."""
+"""Least x, in the frame of the working surface, at which an object stands on the side of the agent camera."""
 
 CAMERA_M: dict[str, tuple[float, float]] = {
     "tabletop": (0.66, 0.71),
@@ -51,20 +51,20 @@ CAMERA_M: dict[str, tuple[float, float]] = {
     "floor": (0.90, 0.65),
     "living_room": (0.61, 0.55),
 }
-"""Where LIBERO's agent camera is, by arena: along x in the frame of the working surface, and above it."""
+"""Position of LIBERO's agent camera, by arena: along x in the frame of the working surface, and above it."""
 
 SAMPLE = 200
-"""Kept episodes of each axis that are looked at, at most: a new scene takes a third of a second."""
+"""Largest number of kept episodes of each axis that are measured: a new scene takes a third of a second."""
 
 CHANGED_LEVELS = 8
-"""A pixel has changed where a channel differs by so many grey levels."""
+"""Least difference of a channel, in grey levels, at which a pixel counts as changed."""
 
 Places = dict[tuple[str, str], list[tuple[str, Shifts]]]
 """Suite and task to the names and displacements of its tests, or of a run's episodes."""
 
 
 class Spread(NamedTuple):
-    """Of ``number`` values: the tenth, fiftieth and ninetieth percentile."""
+    """The tenth, fiftieth and ninetieth percentile of ``number`` values."""
 
     number: int
     low: float
@@ -76,13 +76,13 @@ class Spread(NamedTuple):
 
 
 def spread(values: ArrayLike) -> Spread:
-    """Of one value at least."""
+    """Compute the percentiles of at least one value."""
     measured = np.asarray(values, float)
     return Spread(measured.size, *(round(float(q), 4) for q in np.percentile(measured, [10, 50, 90])))
 
 
 class Share(NamedTuple):
-    """Of ``number`` things, such as scenes, the share of which something is true."""
+    """The share of ``number`` things, such as scenes, for which a statement is true."""
 
     number: int
     share: float
@@ -92,7 +92,7 @@ class Share(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """One thing that is seen; None where there is nothing to measure."""
+    """A visible effect of an axis, for the test tasks and the run; `None` without anything to measure."""
 
     axis: str
     what: str
@@ -101,7 +101,7 @@ class Measure(NamedTuple):
 
 
 class Look(NamedTuple):
-    """One state: the hand in the world's frame, the gap of its fingers, its speed, and that of the fastest object."""
+    """A state: the hand in the world's frame, the gap of its fingers, its speed, and the fastest object's speed."""
 
     position_m: Floats
     rotation: Rotation
@@ -111,7 +111,12 @@ class Look(NamedTuple):
 
     @classmethod
     def of(cls, model: mujoco.MjModel, state: Floats) -> Look:
-        """Args: state: (S,) flattened MuJoCo state of the model."""
+        """Compute the position and speed of the hand, and the speeds of the objects.
+
+        Args:
+            model: the scene.
+            state: (S,) flattened MuJoCo state of the model.
+        """
         data, moving = mujoco.MjData(model), np.empty(6)
         data.qpos[:], data.qvel[:] = state[1 : 1 + model.nq], state[1 + model.nq :]
         mujoco.mj_forward(model, data)
@@ -129,7 +134,7 @@ class Look(NamedTuple):
         )
 
     def measures(self) -> dict[str, float]:
-        """Of an episode that changes nothing."""
+        """Return the measures of an unperturbed episode."""
         return {
             "clean: gripper at the first look (mm)": self.gripper_mm,
             "clean: hand's speed at the first look (cm/s)": self.hand_cm_s,
@@ -137,7 +142,7 @@ class Look(NamedTuple):
         }
 
     def away_from(self, other: Look, component: str, level: int) -> dict[str, float]:
-        """How far the hand is from where it is without a change of the robot."""
+        """Measure how far a perturbation of the robot moves and turns the hand; ``other`` is the twin's state."""
         turned_deg = float(np.degrees((self.rotation * other.rotation.inv()).magnitude()))
         return {
             f"robot: hand moved by {component}, level {level} (cm)": 100 * math.dist(self.position_m, other.position_m),
@@ -146,35 +151,44 @@ class Look(NamedTuple):
 
 
 def measure(run: Run, test: TestSet) -> list[Measure]:
-    """Every measure of a finished run and of the test tasks, axis by axis.
+    """Compute every measure of a finished run and of the test tasks, axis by axis.
 
     Raises:
         PipelineError: when the run lacks a trajectory or frames.
     """
     result = run.outcome
-    # In the order in which they are written: shuffled, so that the first of each axis are of many tasks.
+    # Episodes are kept in a shuffled order, so that the first episodes of each axis are from many tasks.
     kept = [result.row_of[episode_id] for episode_id in result.kept]
-    # Trajectories and frames of those that ``export.where`` leaves out are there too.
+    # Episodes that ``export.where`` leaves out have trajectories and frames, too.
     made = [row for row in result.rows if result.verdicts[row.episode_id].reason in outcome.MADE]
     twins = {row.episode_id: row for row in made if row.role == "twin"}
     seen = _Seen(run, twins)
-    by_axis = [[row for row in kept if row.axis == axis][:SAMPLE] for axis in dict.fromkeys(row.axis for row in kept)]
-    ours = _summaries(chain(*map(seen.of, chain(*by_axis)), to_nearest_draw(test, kept)))
+    sampled: list[Row] = []
+    for axis in dict.fromkeys(row.axis for row in kept):
+        sampled += [row for row in kept if row.axis == axis][:SAMPLE]
+    ours = _summaries(chain(*map(seen.of, sampled), to_nearest_draw(test, kept)))
     run_once = {name: Spread(*values) for name, values in json.loads(SEEN.read_text()).items()}
     tested = run_once | _summaries(chain(*map(_of_test, test.tasks), to_nearest_test(test)))
-    named = ((name.partition(": "), name) for name in sorted({*tested, *ours}))
-    return [Measure(axis, what, tested.get(name), ours.get(name)) for (axis, _, what), name in named]
+    measures = []
+    for name in sorted({*tested, *ours}):
+        axis, _, what = name.partition(": ")
+        measures.append(Measure(axis, what, tested.get(name), ours.get(name)))
+    return measures
 
 
 def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
-    return {
-        name: Share(len(found), round(float(np.mean(found)), 4)) if isinstance(found[0], bool) else spread(found)
-        for name, found in grouped(pairs).items()
-    }
+    """Summarize the values of each name: truth values as a share, numbers as percentiles."""
+    summaries: dict[str, Spread | Share] = {}
+    for name, values in grouped(pairs).items():
+        if isinstance(values[0], bool):
+            summaries[name] = Share(len(values), round(float(np.mean(values)), 4))
+        else:
+            summaries[name] = spread(values)
+    return summaries
 
 
 class _Seen:
-    """What a run has of its episodes; each first look is read once."""
+    """Measures of a run's episodes; each state is read once."""
 
     def __init__(self, run: Run, twins: Mapping[str, Row]):
         self._store = run.trajectories
@@ -183,7 +197,7 @@ class _Seen:
         self._looks: dict[tuple[str, int], Look] = {}
 
     def of(self, row: Row) -> Iterator[tuple[str, float]]:
-        """What an episode shows that changes nothing, or one axis."""
+        """Yield the measures of an episode that is unperturbed or perturbed on one axis."""
         twin = self._twins.get(row.twin_id)
         match from_json(row.perturbations):
             case ():
@@ -221,21 +235,25 @@ class _Seen:
         return self._looks[row.trajectory_id, step]
 
     def _changed(self, row: Row, twin: Row) -> dict[str, Floats]:
-        """View to the (H, W, 3) differences of the first frame from the twin's."""
-        own, others = (self._load(one.episode_id).frames for one in (row, twin))
-        return {view: np.abs(decode(own[view][0]).astype(float) - decode(others[view][0])) for view in SCHEMA.views}
+        """Return the absolute differences of the first frame from the twin's, (H, W, 3), by view."""
+        frames, twin_frames = self._load(row.episode_id).frames, self._load(twin.episode_id).frames
+        differences = {}
+        for view in SCHEMA.views:
+            differences[view] = np.abs(decode(frames[view][0]).astype(float) - decode(twin_frames[view][0]))
+        return differences
 
 
 def _of_test(tested: TestTask) -> Iterator[tuple[str, float]]:
-    known = tested.parameters
+    parameters = tested.parameters
     match tested.axis:
         case "pose":
-            yield from _targets_moved(tested.suite, tested.base, displacements(known), int(known["level"]))
+            moves = displacements(parameters)
+            yield from _targets_moved(tested.suite, tested.base, moves, int(parameters["level"]))
         case "layout":
-            xy_m = np.array([pair.split(",") for pair in str(known["positions"]).split(";")], float)
-            yield from _added(str(known["category"]).split(","), xy_m, str(known["arena"]))
+            xy_m = np.array([pair.split(",") for pair in str(parameters["positions"]).split(";")], float)
+            yield from _added(str(parameters["category"]).split(","), xy_m, str(parameters["arena"]))
         case "language":
-            yield "language: words", len(str(known["text"]).split())
+            yield "language: words", len(str(parameters["text"]).split())
 
 
 def _targets_moved(suite: str, task: str, moves: Shifts, level: int) -> Iterator[tuple[str, float]]:
@@ -245,9 +263,9 @@ def _targets_moved(suite: str, task: str, moves: Shifts, level: int) -> Iterator
 
 
 def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, float]]:
-    """How far the things that a pose test is about are from the nearest place that some rows put them at.
+    """Measure how far the objects of interest of a pose test are from the nearest places that the rows put them at.
 
-    Tests of tasks for which no row moves a thing are left out.
+    Tests of tasks for which no row moves an object of interest are left out.
     """
     drawn: Places = defaultdict(list)
     for row in rows:
@@ -259,23 +277,25 @@ def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, f
 
 
 def to_nearest_test(test: TestSet) -> Iterator[tuple[str, float]]:
-    """The same to the nearest place in another test of the same task: how close tests are to each other."""
-    moved = (((one.suite, one.base), (one.name, displacements(one.parameters))) for one in test.of("pose"))
+    """Measure the distances of pose tests to the nearest place in another test of the same task."""
+    moved = (((task.suite, task.base), (task.name, displacements(task.parameters))) for task in test.of("pose"))
     return _to_nearest(test, grouped(moved))
 
 
 def _to_nearest(test: TestSet, places: Places) -> Iterator[tuple[str, float]]:
     for tested in test.of("pose"):
-        own = displacements(tested.parameters)
+        tested_shifts = displacements(tested.parameters)
         others = [shifts for name, shifts in places[tested.suite, tested.base] if name != tested.name]
         for thing in bddl.read(find_task(tested.suite, tested.base).bddl_file).things_of_interest:
-            apart_m = [math.dist(own[thing], other[thing]) for other in others if thing in other and thing in own]
+            if thing not in tested_shifts:
+                continue
+            apart_m = [math.dist(tested_shifts[thing], shifts[thing]) for shifts in others if thing in shifts]
             if apart_m:
                 yield f"pose: test's thing of interest in {tested.suite} to the nearest other (cm)", 100 * min(apart_m)
 
 
 def _added(models: Sequence[str], xy_m: Floats, arena: str) -> Iterator[tuple[str, float]]:
-    """Of one scene with objects added: their models, and where they stand (N, 2) in the frame of the surface."""
+    """Measure a scene with added objects, by their models and their positions (N, 2) in the frame of the surface."""
     for number in range(1, 6):
         yield f"layout: scenes with {number} added", len(models) == number
     if len(models) > 1:

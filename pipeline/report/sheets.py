@@ -1,4 +1,4 @@
-"""Contact sheets: captioned pictures in rows; and for each axis of a run its episodes beside their clean twins."""
+"""Contact sheets: captioned pictures in rows; for each axis of a run, its episodes next to their clean twins."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,12 +24,12 @@ UNSHOWN = {"sha256", "licence", "attribution", "category"}
 """Parameters that captions leave out."""
 
 LONGEST_CAPTION = 10
-"""Lines; what does not fit is left out; the manifest has the full text."""
+"""Largest number of lines; further text is left out, and the manifest has all of it."""
 
 PAIR_SIDE_PX = 192
 HEADER = "in each pair: the clean twin on the left, the perturbed episode on the right"
 MOMENT = 0.35
-"""Share of the episode after which it is shown: the arm is in view and the objects have not been moved together yet."""
+"""Share of the episode after which it is shown: the arm is in view, and the objects are not moved together yet."""
 
 SPREAD = ("component", "suite", "level", "task")
 """Columns over which the episodes of a sheet are spread, the most important first."""
@@ -47,10 +47,10 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
     """Write one sheet for each perturbed axis of a run.
 
     Args:
-        folder: where the pictures go, one ``<axis>.png`` for each axis with a kept episode that has a twin to show.
+        folder: folder of the pictures, one ``<axis>.png`` for each axis with a kept episode that has a twin to show.
     """
-    shown = twins(manifest)
-    perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed" and row["twin_id"] in shown]
+    twin_ids = twins(manifest).keys()
+    perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed" and row["twin_id"] in twin_ids]
     with replaced(folder) as temporary:
         temporary.mkdir()
         for axis, rows in by_axis(perturbed).items():
@@ -59,9 +59,10 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
 
 
 def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
-    """At most so many rows, chosen so that each component, suite, level and task is among them as often as others.
+    """Choose at most ``most`` rows, so that all components, suites, levels and tasks occur about equally often.
 
-    Each is the row whose component was chosen least often so far; then suite, level and task decide, then the order.
+    Each row is the one whose component was chosen least often so far; then suite, level and task decide, then the
+    order.
     """
     chosen: list[Mapping[str, Any]] = []
     left = list(rows)
@@ -77,25 +78,25 @@ def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, An
 
 def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
     perturbations = from_json(row["perturbations"])
-    shown = []
+    pair = []
     for episode_id in (row["twin_id"], row["episode_id"]):
         frames = load(episode_id).frames["image"]
-        shown.append(decode(frames[_moment(perturbations, len(frames))]))
+        pair.append(decode(frames[_moment(perturbations, len(frames))]))
     changes = "; ".join(map(describe, perturbations))
-    return Tile(side_by_side(shown, PAIR_SIDE_PX), f"{row['suite']}: {changes}")
+    return Tile(side_by_side(pair, PAIR_SIDE_PX), f"{row['suite']}: {changes}")
 
 
 def _moment(perturbations: Sequence[Perturbation], steps: int) -> int:
-    """The step at which episodes of so many steps are shown."""
+    """Return the step at which an episode of ``steps`` steps is shown."""
     for push in perturbations:
         if isinstance(push, DisturbancePerturbation):
             return min(push.first_step + push.steps, steps - 1)
     # The arm is back on the demonstration's path soon after another start.
-    return 0 if any(one.layer is Layer.PHYSICS for one in perturbations) else int(MOMENT * steps)
+    return 0 if any(change.layer is Layer.PHYSICS for change in perturbations) else int(MOMENT * steps)
 
 
 def side_by_side(frames: Sequence[Frame], side_px: int) -> Image.Image:
-    """Frames as one picture, each ``side_px`` wide and high."""
+    """Join frames into one picture, each ``side_px`` wide and high."""
     picture = Image.new("RGB", (len(frames) * side_px, side_px))
     for column, frame in enumerate(frames):
         scaled = Image.fromarray(frame).resize((side_px, side_px), Image.Resampling.LANCZOS)
@@ -104,17 +105,16 @@ def side_by_side(frames: Sequence[Frame], side_px: int) -> Image.Image:
 
 
 def describe(perturbation: Perturbation) -> str:
-    """What was drawn, in one line: component, level and the parameters that are not at their defaults."""
+    """Describe a perturbation in one line: component, level and the parameters that are not at their defaults."""
     parameters = perturbation.model_dump(exclude={"axis", "component", "level", "seed"}, exclude_defaults=True)
-    # A space that does not break lines keeps a value with its name; a wording needs no name.
-    values = ", ".join(
-        f"{name}\N{NO-BREAK SPACE}{value}".removeprefix("text\N{NO-BREAK SPACE}") for name, value in _flat(parameters)
-    )
-    return f"{perturbation.component}, level {perturbation.level}: {values}".removesuffix(": ")
+    # A no-break space keeps a value with its name; a wording needs no name.
+    values = [f"{name}\N{NO-BREAK SPACE}{value}" for name, value in _flat(parameters)]
+    listed = ", ".join(value.removeprefix("text\N{NO-BREAK SPACE}") for value in values)
+    return f"{perturbation.component}, level {perturbation.level}: {listed}".removesuffix(": ")
 
 
 def _flat(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Names and values for people: in one level whatever their nesting, figures rounded."""
+    """Yield names and values for captions: nested parameters in one level, numbers rounded."""
     for name, value in parameters.items():
         if isinstance(value, Mapping):
             yield from _flat(value)
@@ -124,21 +124,24 @@ def _flat(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _shown(value: Any) -> str:
     if isinstance(value, Mapping):
-        return " ".join(shown for _, shown in _flat(value))
+        return " ".join(text for _, text in _flat(value))
     if isinstance(value, Sequence) and not isinstance(value, str):
         return " ".join(map(_shown, value))
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def sheet(title: str, tiles: Sequence[Tile], columns: int = COLUMNS) -> Image.Image:
-    """Captioned pictures in rows of ``columns``; each row is as high as its longest caption needs."""
+    """Arrange captioned pictures in rows of ``columns``; the longest caption of a row determines its height."""
     width, height = tiles[0].picture.size
     columns = min(columns, len(tiles))
     sheet_width = columns * (width + GAP_PX) + GAP_PX
     heading = _wrapped(title, sheet_width - 2 * GAP_PX)
     captions = [_wrapped(tile.caption, width)[:LONGEST_CAPTION] for tile in tiles]
     rows = [range(first, min(first + columns, len(tiles))) for first in range(0, len(tiles), columns)]
-    row_heights = [height + LINE_PX * (max(len(captions[i]) for i in row) + 1) for row in rows]
+    row_heights = []
+    for row in rows:
+        longest = max(len(captions[i]) for i in row)
+        row_heights.append(height + LINE_PX * (longest + 1))
     top = LINE_PX * (len(heading) + 1)
     page = Image.new("RGB", (sheet_width, top + sum(row_heights)), "white")
     _write(page, heading, GAP_PX, GAP_PX)
@@ -158,10 +161,10 @@ def _write(page: Image.Image, lines: Sequence[str], left: int, top: int) -> None
 
 
 def _wrapped(text: str, width_px: int) -> list[str]:
-    """Lines of ``text``, none wider than ``width_px`` unless a single word is."""
+    """Break ``text`` into lines of at most ``width_px``; only a single word may be wider."""
     lines: list[str] = []
     for word in text.split(" "):
-        # The font has no glyph for the space that does not break lines.
+        # The font has no glyph for the no-break space.
         word = word.replace("\N{NO-BREAK SPACE}", " ")
         longer = f"{lines[-1]} {word}" if lines else word
         if lines and _font().getlength(longer) <= width_px:

@@ -1,4 +1,4 @@
-"""Tables of what became of a run's planned episodes: how many were kept, why the others were dropped."""
+"""Tables of a run's planned episodes: the number of kept episodes, and the reasons for dropping the others."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from pipeline.run.counts import Counts, Rows, Target, named, tally
 
 
 class Cell(NamedTuple):
-    """A table's entry, and the share of a whole that a bar behind it shows, None for no bar."""
+    """A table's entry, and the share of a whole that a bar behind it shows, `None` for no bar."""
 
     text: str
     share: float | None = None
@@ -25,10 +25,10 @@ class Table(NamedTuple):
 
 
 def tables(tried: Rows) -> list[Table]:
-    """Yields by suite and by level, drop reasons, and replay modes.
+    """Tabulate yields by suite and by level, drop reasons, and replay modes.
 
     Args:
-        tried: the episodes that were tried, reserves only where they were needed.
+        tried: the episodes that were tried, with reserves only if they were needed.
     """
     return [
         by_suite(tried),
@@ -39,7 +39,7 @@ def tables(tried: Rows) -> list[Table]:
 
 
 def wanted_and_kept(targets: Mapping[str, Target]) -> Table:
-    """Kept episodes of each axis beside those that the configuration wants."""
+    """Tabulate the kept episodes of each axis next to the number that the configuration wants."""
     body: list[tuple[Cell, ...]] = []
     for axis, target in targets.items():
         share = min(1.0, target.kept / target.wanted) if target.wanted else None
@@ -48,32 +48,32 @@ def wanted_and_kept(targets: Mapping[str, Target]) -> Table:
 
 
 def by_suite(tried: Rows) -> Table:
-    """Yields by axis and suite, with totals."""
+    """Tabulate yields by axis and suite, with totals."""
     suites = named(tried, "suite")
+    head = ("axis", *(suite.removeprefix("libero_") for suite in suites), "all")
     lines: list[tuple[str, dict[str, str]]] = [(axis, {"axis": axis}) for axis in named(tried, "axis")]
-    return Table(
-        "kept of planned, by suite",
-        ("axis", *(suite.removeprefix("libero_") for suite in suites), "all"),
-        [
-            (
-                Cell(name),
-                *(_kept(Counts.of(tried, suite=suite, **of)) for suite in suites),
-                _kept(Counts.of(tried, **of)),
-            )
-            for name, of in (*lines, ("all", {}))
-        ],
-    )
+    body: list[tuple[Cell, ...]] = []
+    for name, of in (*lines, ("all", {})):
+        by_suites = [_kept(Counts.of(tried, suite=suite, **of)) for suite in suites]
+        body.append((Cell(name), *by_suites, _kept(Counts.of(tried, **of))))
+    return Table("kept of planned, by suite", head, body)
 
 
 def by_level(title: str, tried: Rows, axis: str | None = None) -> Table:
-    """Yields by level, of each axis, or of each component of one; what several axes perturb counts with each."""
+    """Tabulate yields by level, for each axis, or for each component of one axis.
+
+    An episode that several axes perturb counts for each of them.
+    """
     cells: dict[str, dict[int, list[Mapping[str, Any]]]] = {}
     for row in tried:
         for made in from_json(row["perturbations"]):
             if axis in (None, made.axis):
                 name = made.axis if axis is None else made.component.replace("_", " ")
                 cells.setdefault(name, defaultdict(list))[made.level].append(row)
-    body = [(Cell(key), *(_kept(Counts.of(found[level])) for level in LEVELS)) for key, found in cells.items()]
+    body: list[tuple[Cell, ...]] = []
+    for name, rows_of_level in cells.items():
+        by_levels = [_kept(Counts.of(rows_of_level[level])) for level in LEVELS]
+        body.append((Cell(name), *by_levels))
     return Table(title, ("level", *map(str, LEVELS)), body)
 
 
@@ -86,8 +86,8 @@ def _kept(counts: Counts) -> Cell:
 def _by_axis(title: str, rows: Rows, column: str) -> Table:
     counts = tally(rows, column)
     values = sorted({value for of_axis in counts.values() for value in of_axis})
-    body = [
-        (Cell(axis), *(Cell(f"{of_axis[value]:,}" if of_axis[value] else "-") for value in values))
-        for axis, of_axis in counts.items()
-    ]
+    body: list[tuple[Cell, ...]] = []
+    for axis, of_axis in counts.items():
+        numbers = [Cell(f"{of_axis[value]:,}" if of_axis[value] else "-") for value in values]
+        body.append((Cell(axis), *numbers))
     return Table(title, ("axis", *values), body)

@@ -1,1 +1,1 @@
-"""Reading finished datasets back as their clients do, and saying what is off."""
+"""Checks that read finished datasets as their clients do, and report errors."""

@@ -1,7 +1,8 @@
-"""How near a dataset comes to the benchmark's test tasks, whoever made it and whatever was done to it since.
+"""Distance of a dataset from the benchmark's test tasks, also of third-party and of edited datasets.
 
-What an episode shows counts first: the instruction, and the matrices of the camera where the dataset has them. Of the
-other axes only this project's labels tell (``perturbations``), in the dataset or, by ``episode_id``, in a manifest.
+The audit first reads what an episode shows: the instruction, and the camera's matrices if the dataset has them. For
+the other axes it needs this project's labels (``perturbations``). They come from the dataset or, by ``episode_id``,
+from a manifest.
 """
 
 import json
@@ -39,14 +40,14 @@ LABELS = ("suite", "task", "perturbations")
 
 @dataclass(frozen=True)
 class Found:
-    """What a dataset tells of one episode.
+    """An episode as a dataset describes it.
 
     Attributes:
-        episode_id: this project's name of it, or what the dataset calls it.
-        instruction: what the policy is told; None where the dataset has no text.
-        extrinsics: (4, 4) from the agent view to the world (z forward, y down); None where the dataset has none.
-        suite, task: of the labels, perhaps of no task that is known here; None where nothing tells.
-        perturbations: the labels, as the manifest writes them; None where there are none.
+        episode_id: this project's name of the episode, or else the dataset's.
+        instruction: text that the policy gets; `None` if the dataset has no text.
+        extrinsics: (4, 4) from the agent view to the world (z forward, y down); `None` if the dataset has no matrices.
+        suite, task: labels, which may name a task that this project does not have; `None` without labels.
+        perturbations: labels as the manifest writes them; `None` without labels.
     """
 
     episode_id: str
@@ -59,15 +60,15 @@ class Found:
 
 @dataclass(frozen=True)
 class Audit:
-    """What an audit found.
+    """The result of an audit.
 
     Attributes:
-        axes: axis to how close its episodes come to the test tasks.
-        unlabelled: episodes without labels, of which nothing is known but the instruction and the camera.
-        without_camera: unlabelled episodes without the camera's matrices.
-        without_task: episodes that no known task was found for.
-        without_instruction: episodes without a text to compare.
-        unplaced: axis to the episodes that it perturbs and whose task is not known, so nothing can be compared.
+        axes: axis to the distance of its episodes from the test tasks.
+        unlabelled: number of episodes without labels, which show only their instruction and camera.
+        without_camera: number of unlabelled episodes without the camera's matrices.
+        without_task: number of episodes that match no task of this project.
+        without_instruction: number of episodes without an instruction to compare.
+        unplaced: axis to the number of episodes that it perturbs but that match no task, so they cannot be compared.
     """
 
     episodes: int
@@ -80,7 +81,7 @@ class Audit:
 
     @property
     def unknown(self) -> dict[str, int]:
-        """Axis to the number of episodes of which nothing tells whether it perturbs them."""
+        """Map each axis to the number of episodes that it may or may not perturb."""
         counts = Counter({axis: self.unlabelled for axis in AXES if axis != "language"})
         counts |= {"camera": self.without_camera, "language": self.without_instruction}
         counts.update(self.unplaced)
@@ -91,44 +92,47 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
     """Compare every episode of a dataset with the benchmark's test tasks.
 
     Args:
-        dataset: a folder with an RLDS set (as TFDS writes it) or a LeRobot set (v3.0 or v2.1), or several below it.
-        manifest: gives the labels of episodes that have an ``episode_id`` and lost theirs.
+        dataset: a folder with an RLDS set (as TFDS writes it) or a LeRobot set (v3.0 or v2.1), or with several sets.
+        manifest: labels for episodes that have an ``episode_id`` but lost their labels.
 
     Raises:
         PipelineError: when there is no such dataset, or it cannot be read.
     """
-    known = {} if manifest is None else _manifest(manifest)
-    episodes = [
-        replace(one, **{name: known[one.episode_id][name] for name in LABELS})
-        if one.perturbations is None and one.episode_id in known
-        else one
-        for one in read(dataset)
-    ]
-    found = [_task_of(one) for one in episodes]
-    rows = [_row(one, task, test) for one, task in zip(episodes, found, strict=True)]
-    without_task = [one for one, task in zip(episodes, found, strict=True) if task is None]
+    manifest_rows = {} if manifest is None else _manifest(manifest)
+    episodes: list[Found] = []
+    for episode in read(dataset):
+        if episode.perturbations is None and episode.episode_id in manifest_rows:
+            row = manifest_rows[episode.episode_id]
+            labels = {name: row[name] for name in LABELS}
+            episodes.append(replace(episode, **labels))
+        else:
+            episodes.append(episode)
+    episode_tasks = [_task_of(episode) for episode in episodes]
+    rows = [_row(episode, task, test) for episode, task in zip(episodes, episode_tasks, strict=True)]
+    without_task = [episode for episode, task in zip(episodes, episode_tasks, strict=True) if task is None]
+    unlabelled = [episode for episode in episodes if episode.perturbations is None]
+    unplaced: Counter[str] = Counter()
+    for episode in without_task:
+        unplaced.update(label.axis for label in _labels(episode) if _needs_task(label))
     return Audit(
         episodes=len(episodes),
         axes=compare(rows, test),
-        unlabelled=sum(one.perturbations is None for one in episodes),
-        without_camera=sum(one.perturbations is None and one.extrinsics is None for one in episodes),
+        unlabelled=len(unlabelled),
+        without_camera=sum(episode.extrinsics is None for episode in unlabelled),
         without_task=len(without_task),
-        without_instruction=sum(one.instruction is None for one in episodes),
-        unplaced=dict(Counter(p.axis for one in without_task for p in _labels(one) if _needs_task(p))),
+        without_instruction=sum(episode.instruction is None for episode in episodes),
+        unplaced=dict(unplaced),
     )
 
 
 def read(dataset: Path) -> Iterator[Found]:
-    """The episodes of a dataset, or of all those below a folder.
+    """Yield the episodes of all datasets in or below a folder.
 
     Raises:
-        PipelineError: when there is none, or it cannot be read.
+        PipelineError: when there is no dataset, or it cannot be read.
     """
-    rlds, lerobot = (
-        # A hidden folder has what is not finished.
-        sorted(file for file in dataset.rglob(name) if not re.search(r"(^|/)\.", str(file.relative_to(dataset))))
-        for name in ("features.json", "meta/info.json")
-    )
+    rlds = _visible_files(dataset, "features.json")
+    lerobot = _visible_files(dataset, "meta/info.json")
     if not rlds and not lerobot:
         raise PipelineError(
             "no dataset below this folder",
@@ -144,27 +148,34 @@ def read(dataset: Path) -> Iterator[Found]:
         raise PipelineError(f"cannot be read ({type(error).__name__}: {error})", where=dataset) from error
 
 
+def _visible_files(folder: Path, name: str) -> list[Path]:
+    """List the files of a name below a folder, except in hidden folders, which hold unfinished datasets."""
+    files = folder.rglob(name)
+    return sorted(file for file in files if not re.search(r"(^|/)\.", str(file.relative_to(folder))))
+
+
 def _rlds(folder: Path) -> Iterator[Found]:
     features = tfds.builder_from_directory(folder).info.features
     for shard in sorted(folder.glob("*.tfrecord*")):
         for number, record in enumerate(records(shard)):
             step = columns(record, features)
-            said = {name.removeprefix(METADATA): value for name, value in step.items() if name.startswith(METADATA)}
-            text = {name: said[name][0].decode() for name in ("episode_id", *LABELS) if name in said}
-            episode_id, instruction = text.pop("episode_id", ""), step["language_instruction"][0].decode()
-            yield Found(
-                episode_id or f"{shard.name}:{number}", instruction or None, said.get("image_extrinsics"), **text
-            )
+            stored = {name.removeprefix(METADATA): value for name, value in step.items() if name.startswith(METADATA)}
+            text = {name: stored[name][0].decode() for name in ("episode_id", *LABELS) if name in stored}
+            episode_id = text.pop("episode_id", "") or f"{shard.name}:{number}"
+            instruction = step["language_instruction"][0].decode() or None
+            yield Found(episode_id, instruction, stored.get("image_extrinsics"), **text)
 
 
 def _lerobot(folder: Path) -> Iterator[Found]:
-    if (lines := folder / "meta" / "episodes.jsonl").is_file():
+    lines = folder / "meta" / "episodes.jsonl"
+    if lines.is_file():
         episodes = [json.loads(line) for line in lines.read_text().splitlines()]
     else:
         files = sorted((folder / "meta" / "episodes").rglob("*.parquet"))
-        named = ["episode_index", "tasks"]
-        episodes = [row for file in files for row in pq.read_table(file, columns=named).to_pylist()]
-    # Tools that delete, split or merge leave the provenance behind, and a folder may have both.
+        episodes = []
+        for file in files:
+            episodes += pq.read_table(file, columns=["episode_index", "tasks"]).to_pylist()
+    # Tools that delete, split or merge episodes do not copy the provenance. Then the ids may still be in the data.
     provenance = folder / "meta" / "provenance.parquet"
     stored = pq.read_table(provenance).to_pylist() if provenance.is_file() else []
     labels = {row["episode_index"]: row for row in stored}
@@ -182,12 +193,12 @@ def _lerobot(folder: Path) -> Iterator[Found]:
 
 
 def _ids(folder: Path) -> dict[int, str]:
-    found: dict[int, str] = {}
+    ids: dict[int, str] = {}
     for file in sorted((folder / "data").rglob("*.parquet")):
         if EPISODE_ID in pq.read_schema(file).names:
             table = pq.read_table(file, columns=["episode_index", EPISODE_ID])
-            found |= dict(zip(table["episode_index"].to_pylist(), table[EPISODE_ID].to_pylist(), strict=True))
-    return found
+            ids |= dict(zip(table["episode_index"].to_pylist(), table[EPISODE_ID].to_pylist(), strict=True))
+    return ids
 
 
 def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
@@ -196,49 +207,51 @@ def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
     return {row["episode_id"]: row for row in rows.to_pylist()}
 
 
-def _row(one: Found, task: Task | None, test: TestSet) -> Compared:
-    """What an episode shows in the axes' own parameters; what only labels tell is taken from these."""
-    seen = [p for p in _labels(one) if task is not None or not _needs_task(p)]
-    if one.extrinsics is not None:
-        seen = [p for p in seen if p.axis != "camera"]
+def _row(episode: Found, task: Task | None, test: TestSet) -> Compared:
+    """Describe an episode in the axes' parameters, as far as it shows them, or else by its labels."""
+    perturbations = [p for p in _labels(episode) if task is not None or not _needs_task(p)]
+    if episode.extrinsics is not None:
+        perturbations = [p for p in perturbations if p.axis != "camera"]
         arenas = list(AGENT_VIEWS) if task is None else [bddl.read(task.bddl_file).arena]
-        cameras = [moved_to(one.extrinsics, arena) for arena in arenas]
+        cameras = [moved_to(episode.extrinsics, arena) for arena in arenas]
         if None not in cameras:
             anywhere = tasks(TESTED_SUITES[0])[0]
-            seen.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
+            perturbations.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
+    text = episode.instruction
     rewrites = []
-    if one.instruction is not None and (task is None or normalise(one.instruction) != normalise(task.instruction)):
-        rewrites = [LanguagePerturbation(component="paraphrase", level=1, text=one.instruction)]
-    if task is None:  # an unknown episode is compared with the task whose test instructions come nearest
+    if text is not None and (task is None or normalise(text) != normalise(task.instruction)):
+        rewrites = [LanguagePerturbation(component="paraphrase", level=1, text=text)]
+    if task is None:
+        # Without a task, the episode is compared with the task whose test instructions are nearest.
         every = [task for suite in TESTED_SUITES for task in tasks(suite)]
         task = min(every, key=lambda task: rewrites[0].nearest(test, task).distance) if rewrites else every[0]
-    return Compared(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
+    return Compared(episode.episode_id, task.suite, task.name, to_json([*perturbations, *rewrites]))
 
 
-def _labels(one: Found) -> list[Perturbation]:
-    """The labels of an episode but language, which its instruction shows."""
-    labels = () if one.perturbations is None else from_json(one.perturbations)
+def _labels(episode: Found) -> list[Perturbation]:
+    """Return the labels of an episode except language, which its instruction shows."""
+    labels = () if episode.perturbations is None else from_json(episode.perturbations)
     return [p for p in labels if p.axis != "language"]
 
 
 def _needs_task(perturbation: Perturbation) -> bool:
-    """Whether it is compared only with the test tasks of one task or scene."""
+    """Return whether the perturbation is compared only with the test tasks of one task or scene."""
     return perturbation.same is not None
 
 
-def _task_of(one: Found) -> Task | None:
-    """By the labels, else by the instruction; labels may name a suite of somebody else's."""
-    if one.suite and one.task:
+def _task_of(episode: Found) -> Task | None:
+    """Find the task by the labels, or else by the instruction; labels may name a third-party suite."""
+    if episode.suite and episode.task:
         try:
-            return find_task(one.suite, one.task)
+            return find_task(episode.suite, episode.task)
         except PipelineError:
             return None
-    return None if one.instruction is None else _tasks_by_text().get(normalise(one.instruction))
+    return None if episode.instruction is None else _tasks_by_text().get(normalise(episode.instruction))
 
 
 @cache
 def _tasks_by_text() -> dict[str, Task]:
-    """Own instructions and rewrites of the tasks that the benchmark perturbs, normalised."""
+    """Map normalised instructions and their rewrites to the tasks that the benchmark perturbs."""
     by_text: dict[str, Task] = {}
     bank = load_bank()
     for suite in TESTED_SUITES:

@@ -1,4 +1,4 @@
-"""One episode wherever it lies, which the checks look at."""
+"""Data of one episode from the run's stores and from its datasets, which the checks compare."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -23,7 +23,7 @@ class Seen:
 
     Attributes:
         frames: sampled step to its frame, (H, W, 3).
-        video: whether they are of a video.
+        video: True if the frames were decoded from a video.
     """
 
     dataset: str
@@ -33,22 +33,24 @@ class Seen:
 
     @cached_property
     def grey(self) -> dict[int, NDArray[np.uint8]]:
-        """The same frames, (H, W) each."""
-        return {
-            step: np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8) for step, frame in self.frames.items()
-        }
+        """The frames in grey, (H, W) each."""
+        grey = {}
+        for step, frame in self.frames.items():
+            grey[step] = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
+        return grey
 
 
 @dataclass(frozen=True)
 class Case:
-    """One episode and everything known of it.
+    """An episode in all places that store it.
 
     Attributes:
-        made: as the episode store has it.
+        row: its row of the manifest.
+        made: the episode in the run's stores.
         trajectory: the replay that it was rendered from.
-        copies: as each dataset has it, as far as it could be read.
+        copies: the episode in each dataset from which it could be read.
         bank: the run's own bank of rewrites.
-        witness: whether it is one of the few of which all frames are decoded.
+        witness: True if all frames of the episode are decoded, which is done for a few episodes only.
     """
 
     row: Mapping[str, Any]
@@ -60,49 +62,50 @@ class Case:
 
     @cached_property
     def levels(self) -> dict[str, NDArray[np.int64]]:
-        """View to how often each level occurs in each channel of all of its stored frames, (3, 256)."""
+        """Histogram of levels in each channel of all stored frames, (3, 256), by view."""
         return {view: _levels(map(decode, files)) for view, files in self.made.frames.items()}
 
     @cached_property
     def sampled_levels(self) -> dict[str, NDArray[np.int64]]:
-        """View to the same of its sampled frames."""
+        """Histogram of levels in each channel of the sampled frames, (3, 256), by view."""
         return {view: _levels(seen.frames.values()) for view, seen in self.stored.items()}
 
     @cached_property
     def stored(self) -> dict[str, Seen]:
-        """View to what the store shows there."""
+        """Sampled frames of the store, by view."""
         steps = sampled(len(self.made))
-        return {
-            view: Seen("frames", view, {step: decode(files[step]) for step in steps})
-            for view, files in self.made.frames.items()
-        }
+        views = {}
+        for view, files in self.made.frames.items():
+            frames = {step: decode(files[step]) for step in steps}
+            views[view] = Seen("frames", view, frames)
+        return views
 
     @cached_property
     def seen(self) -> list[Seen]:
-        """The views of the store, and those of the copies that are not the very files of the store."""
-        found = [*self.stored.values()]
+        """Views of the store, and views of the copies whose files differ from the store's."""
+        views = [*self.stored.values()]
         for copy in self.whole:
             for view, stored in self.stored.items():
                 files = copy.episode.frames.get(view)
                 if files and all(files[step] == self.made.frames[view][step] for step in stored.frames):
                     continue
-                # Of what cannot be decoded, ``jpeg`` tells, and ``format`` where a view is not there.
+                # ``jpeg`` reports files that cannot be decoded, and ``format`` reports missing views.
                 with suppress(ValueError, TypeError, LookupError, cv2.error):
                     frames = {step: copy.frame(view, step) for step in stored.frames}
-                    found.append(Seen(copy.dataset, view, frames, video=not files))
-        return found
+                    views.append(Seen(copy.dataset, view, frames, video=not files))
+        return views
 
     @cached_property
     def whole(self) -> list[Copy]:
-        """The copies of the right shapes: what else is wrong with the others follows from that."""
-        return [
-            copy
-            for copy in self.copies
-            if all(getattr(copy.episode, name).shape == getattr(self.made, name).shape for name in MOTION)
-        ]
+        """Copies with the right shapes. A copy with a wrong shape would fail most checks for that reason alone."""
+        return [copy for copy in self.copies if _same_shapes(copy.episode, self.made)]
 
     def finding(self, dataset: str, what: str, expected: object) -> Fault:
         return Fault(dataset, self.made.episode_id, what, str(expected))
+
+
+def _same_shapes(copy: Episode, made: Episode) -> bool:
+    return all(getattr(copy, name).shape == getattr(made, name).shape for name in MOTION)
 
 
 def _levels(frames: Iterable[Frame]) -> NDArray[np.int64]:

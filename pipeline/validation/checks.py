@@ -1,4 +1,4 @@
-"""What must hold of an episode wherever it lies: small functions, each with a name, that yield what is off."""
+"""Checks of an episode in all places that store it: each is a small function that yields the errors it finds."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
@@ -18,143 +18,157 @@ from pipeline.types import Frame
 from pipeline.validation.case import Case
 
 VIDEO_PSNR_DB = 32.0
-"""Least PSNR, in grey, of a video's frame to the stored JPEG; panning over 30 procedural data maps it is 37.0 or more.
+"""Least PSNR, in grey, of a video's frame to the stored JPEG; the least of pans over 30 procedural maps was 37.0.
 
-In colour it can be 20: a video holds colours at half the resolution, which a fine, colourful surface shows."""
+In colour it can be 20: a video stores colours at half the resolution, which shows on fine, colourful surfaces."""
 
 COLOURS_OFF = 0.5
-"""Share of a stored frame's colourfulness by which a video's colours may differ; of 3,843 frames the most was 0.14.
-Grey frames are off by 1, and those with red and blue exchanged by more."""
+"""Share of a stored frame's colourfulness by which a video's colours may differ; the most of 3,843 frames was 0.14.
+Grey frames differ by 1, and frames with red and blue exchanged differ by more."""
 
 PALE_LEVELS = 4.0
-"""Frames count as at least so colourful: the mean distance of Cb and Cr from grey, in levels, over 16 by 16 fields."""
+"""Least colourfulness assumed of a frame: mean distance of Cb and Cr from grey, in levels, over 16 by 16 fields."""
 
 STILL_LEVELS = 0.5
-"""Mean difference in grey levels up to which two frames count as the same; the least of 49 episodes was 1.4."""
+"""Mean difference in grey levels up to which two frames count as equal; the least of 49 episodes was 1.4."""
 
 BLANK_LEVELS = 5.0
-"""Standard deviation in grey levels below which a frame shows nothing; the least was 27, in fog."""
+"""Standard deviation in grey levels below which a frame counts as blank; the least was 27, in fog."""
 
 AGAINST_M = 0.03
-"""How far the fingers may move, in sum, against the command: pressed on the stove's knob, they moved 0.015 m; the other
-way round, 49 episodes moved 0.05 m and more with it."""
+"""Sum of the distances that the fingers may move against the command.
+
+Fingers pressed on the stove's knob moved 0.015 m. With the opposite sign, 49 episodes moved 0.05 m or more."""
 
 
-def _colours_off(one: Frame, stored: Frame) -> float:
-    """The mean distance of Cb and Cr over 16 by 16 fields, as a share of the stored frame's from grey."""
-    fields = (
-        cv2.cvtColor(cv2.resize(frame, (16, 16), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2YCrCb)[..., 1:]
-        for frame in (one, stored)
-    )
-    found, wanted = (field.astype(float) - 128 for field in fields)
-    return float(np.abs(found - wanted).mean() / max(np.abs(wanted).mean(), PALE_LEVELS))
+def _chroma(frame: Frame) -> NDArray[np.float64]:
+    """Return Cb and Cr relative to grey, in levels, over 16 by 16 fields: (16, 16, 2)."""
+    fields = cv2.resize(frame, (16, 16), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(fields, cv2.COLOR_RGB2YCrCb)[..., 1:].astype(float) - 128
+
+
+def _colours_off(frame: Frame, stored: Frame) -> float:
+    """Return the mean difference of Cb and Cr, as a share of the stored frame's mean distance from grey."""
+    chroma, expected = _chroma(frame), _chroma(stored)
+    return float(np.abs(chroma - expected).mean() / max(np.abs(expected).mean(), PALE_LEVELS))
 
 
 def length(case: Case) -> Iterator[Fault]:
-    """As many steps in every place as the replay executed."""
+    """Check that every place has as many steps as the replay executed."""
     steps = len(case.trajectory.actions)
     places = [("manifest", case.row["steps"]), ("frames", len(case.made))]
-    for dataset, found in [*places, *((copy.dataset, len(copy)) for copy in case.copies)]:
-        if found != steps:
-            yield case.finding(dataset, f"has {found} steps", steps)
+    places += [(copy.dataset, len(copy)) for copy in case.copies]
+    for dataset, number in places:
+        if number != steps:
+            yield case.finding(dataset, f"has {number} steps", steps)
 
 
 ARM = slice(1, 8)
-"""Of a flattened state, after the time: LIBERO's robot comes first in every scene."""
+"""Joint angles in a flattened state, after the time: LIBERO's robot comes first in every scene."""
 
 
 def motion(case: Case) -> Iterator[Fault]:
-    """Actions, states and joint angles, bit for bit; actions and joint angles are those of the replay."""
+    """Check actions, states and joint angles, bit for bit; actions and joint angles must be the replay's."""
     replay = case.trajectory
     if not _same(case.made.joint_state, replay.states[:-1, ARM].astype(np.float32)):
         yield case.finding("frames", "has other joint angles", "those of the replay")
     if not _same(case.made.action, replay.actions.astype(np.float32)):
         yield case.finding("frames", "has other actions", "those that the replay executed")
     for copy in case.copies:
-        # Of another length, nothing can be compared.
+        # Copies of another length cannot be compared; ``length`` reports them.
         for name in MOTION if len(copy) == len(case.made) else ():
-            found, made = getattr(copy.episode, name), getattr(case.made, name)
-            if (found.shape, found.dtype) != (made.shape, made.dtype):
-                what, expected = f"{found.shape} of {found.dtype}", f"{made.shape} of {made.dtype}"
+            values, made = getattr(copy.episode, name), getattr(case.made, name)
+            if (values.shape, values.dtype) != (made.shape, made.dtype):
+                what, expected = f"{values.shape} of {values.dtype}", f"{made.shape} of {made.dtype}"
                 yield case.finding(copy.dataset, f"{name} is {what}", expected)
-            elif not _same(found, made):
-                step = next(t for t in range(len(made)) if not _same(found[t], made[t]))
-                what = f"{name} of step {step} is {found[step].tolist()}"
+            elif not _same(values, made):
+                step = next(t for t in range(len(made)) if not _same(values[t], made[t]))
+                what = f"{name} of step {step} is {values[step].tolist()}"
                 yield case.finding(copy.dataset, what, made[step].tolist())
 
 
 def instruction(case: Case) -> Iterator[Fault]:
-    """The manifest's instruction at every step, and in a language column, the episode's rewrites and subtasks."""
+    """Check the instruction at every step, and the rewrites and subtasks in a language column."""
     for copy in case.whole:
-        if wrong := set(copy.instructions) - {case.row["instruction"]}:
+        wrong = set(copy.instructions) - {case.row["instruction"]}
+        if wrong:
             yield case.finding(copy.dataset, f"instruction {min(wrong)!r}", repr(case.row["instruction"]))
-        expected = _said(case, copy.train)
-        for step, entries in enumerate(copy.said or ()):
-            said = [(one["role"], one["style"], one["content"], np.float32(one["timestamp"])) for one in entries]
-            if said != expected:
-                strange = [one for one in said if one not in expected]
-                lacking = [one for one in expected if one not in said]
+        expected = _language_entries(case, copy.train)
+        for step, stored in enumerate(copy.said or ()):
+            entries = [(row["role"], row["style"], row["content"], np.float32(row["timestamp"])) for row in stored]
+            if entries != expected:
+                strange = [entry for entry in entries if entry not in expected]
+                lacking = [entry for entry in expected if entry not in entries]
                 yield case.finding(copy.dataset, f"language column of step {step} has {strange}", lacking)
                 break
 
 
-def _said(case: Case, train: bool) -> list[tuple[str, str, str, np.float32]]:
-    """What lerobot's language column says: the rewrites, of what is trained on alone, and the subtasks."""
+def _language_entries(case: Case, train: bool) -> list[tuple[str, str, str, np.float32]]:
+    """List the entries of lerobot's language column: the rewrites, in the training split only, and the subtasks."""
     rewrites = case.made.rewrites if train else ()
-    texts = dict.fromkeys([case.row["instruction"], *rewrites]) if rewrites else ()
-    begun = [("assistant", "subtask", one.text, np.float32(one.step / SCHEMA.fps_hz)) for one in case.made.subtasks]
-    return [*(("user", "task_aug", text, np.float32(0)) for text in texts), *begun]
+    entries: list[tuple[str, str, str, np.float32]] = []
+    if rewrites:
+        texts = dict.fromkeys([case.row["instruction"], *rewrites])
+        entries += [("user", "task_aug", text, np.float32(0)) for text in texts]
+    for subtask in case.made.subtasks:
+        entries.append(("assistant", "subtask", subtask.text, np.float32(subtask.step / SCHEMA.fps_hz)))
+    return entries
 
 
 def wording(case: Case) -> Iterator[Fault]:
-    """The task's own instruction or the rewrite of the bank that was drawn, and nothing of a file's name in it."""
+    """Check that the instruction is the task's or the sampled rewrite of the bank, without parts of a file's name."""
     task, text = find_task(case.row["suite"], case.row["task"]), case.row["instruction"]
     expected = task.instruction
-    for drawn in of_layer(from_json(case.row["perturbations"]), TextPerturbation):
-        expected = drawn.apply(expected)
-        if isinstance(drawn, LanguagePerturbation) and drawn not in deal(task, bank=case.bank):
-            yield case.finding("manifest", f"rewrite {drawn.text!r} is not in the bank", f"one for {task.name}")
+    for change in of_layer(from_json(case.row["perturbations"]), TextPerturbation):
+        expected = change.apply(expected)
+        if isinstance(change, LanguagePerturbation) and change not in deal(task, bank=case.bank):
+            yield case.finding("manifest", f"rewrite {change.text!r} is not in the bank", f"one for {task.name}")
     if text != expected:
         yield case.finding("manifest", f"instruction {text!r}", repr(expected))
-    if found := debris(text):
-        yield case.finding("manifest", f"instruction {text!r} has {found!r}", WITHOUT_DEBRIS)
+    leftover = debris(text)
+    if leftover:
+        yield case.finding("manifest", f"instruction {text!r} has {leftover!r}", WITHOUT_DEBRIS)
 
 
 def provenance(case: Case) -> Iterator[Fault]:
-    """The manifest's provenance, but for this project's version: a manifest is made anew where a dataset stays."""
+    """Check the manifest's provenance.
+
+    This project's version may differ, because a manifest can be newer than its dataset.
+    """
     for copy in case.copies:
         for column in case.made.provenance:
-            found, expected = copy.episode.provenance.get(column), case.row[column]
-            if found != expected and column != OWN_VERSION:
-                yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
+            value, expected = copy.episode.provenance.get(column), case.row[column]
+            if value != expected and column != OWN_VERSION:
+                yield case.finding(copy.dataset, f"{column} is {value!r}", repr(expected))
 
 
 def place(case: Case) -> Iterator[Fault]:
-    """Where the manifest says."""
+    """Check that each dataset stores the episode at the place that the manifest states."""
     for copy in case.copies:
-        told = {column: case.row[column] for column in copy.place}
-        if told != copy.place:
-            yield case.finding("manifest", _listed(told), f"{_listed(copy.place)}, where it lies")
+        stated = {column: case.row[column] for column in copy.place}
+        if stated != copy.place:
+            yield case.finding("manifest", _listed(stated), f"{_listed(copy.place)}, where it lies")
 
 
 def jpeg(case: Case) -> Iterator[Fault]:
-    """The very bytes of every stored frame, where a dataset has image files."""
+    """Check that the image files of a dataset have the bytes of the stored frames."""
     for copy in case.copies:
         for view, files in copy.episode.frames.items():
             pairs = zip(files, case.made.frames[view], strict=False)
-            if wrong := [step for step, (one, other) in enumerate(pairs) if one != other]:
+            wrong = [step for step, (file, stored) in enumerate(pairs) if file != stored]
+            if wrong:
                 what = f"{view} differs at {len(wrong)} steps, first at {wrong[0]}"
                 yield case.finding(copy.dataset, what, "the stored JPEG")
 
 
 def geometry(case: Case) -> Iterator[Fault]:
-    """The matrices of the stored cameras, bit for bit, and of the extras the very files and numbers."""
+    """Check the matrices of the cameras, bit for bit, and the files and numbers of the extras."""
     for copy in case.whole:
         for view, made in case.made.geometry.items():
             for name in MATRICES:
-                found, expected = getattr(copy.episode.geometry[view], name), getattr(made, name)
-                if found.dtype != expected.dtype or not np.array_equal(found, expected):
-                    yield case.finding(copy.dataset, f"{view}_{name} is {found.tolist()}", expected.tolist())
+                matrix, expected = getattr(copy.episode.geometry[view], name), getattr(made, name)
+                if matrix.dtype != expected.dtype or not np.array_equal(matrix, expected):
+                    yield case.finding(copy.dataset, f"{view}_{name} is {matrix.tolist()}", expected.tolist())
             for name, files in made.maps.items():
                 if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
@@ -165,28 +179,31 @@ def geometry(case: Case) -> Iterator[Fault]:
 
 
 def video(case: Case) -> Iterator[Fault]:
-    """Frames within ``VIDEO_PSNR_DB`` and ``COLOURS_OFF`` of the stored ones, where a dataset has no image files."""
+    """Check that frames of videos are within ``VIDEO_PSNR_DB`` and ``COLOURS_OFF`` of the stored frames."""
     for seen in case.seen:
         stored, within = case.stored[seen.view], f"{VIDEO_PSNR_DB} or more"
         for step, frame in seen.frames.items() if seen.video else ():
             name = f"{seen.view} of step {step}"
-            if (reached := cv2.PSNR(seen.grey[step], stored.grey[step])) < VIDEO_PSNR_DB:
-                yield case.finding(seen.dataset, f"{name} has {reached:.1f} dB", within)
-            elif (off := _colours_off(frame, stored.frames[step])) > COLOURS_OFF:
-                yield case.finding(seen.dataset, f"{name} has other colours ({off:.2f})", f"{COLOURS_OFF}")
+            psnr_db = cv2.PSNR(seen.grey[step], stored.grey[step])
+            if psnr_db < VIDEO_PSNR_DB:
+                yield case.finding(seen.dataset, f"{name} has {psnr_db:.1f} dB", within)
+                continue
+            difference = _colours_off(frame, stored.frames[step])
+            if difference > COLOURS_OFF:
+                yield case.finding(seen.dataset, f"{name} has other colours ({difference:.2f})", f"{COLOURS_OFF}")
 
 
 def cameras(case: Case) -> Iterator[Fault]:
-    """No view that shows what another camera saw."""
+    """Check that no view shows the picture of another camera."""
     for seen in case.seen:
         for step, frame in seen.grey.items():
-            for other in case.stored.keys() - {seen.view}:
-                if cv2.PSNR(frame, case.stored[other].grey[step]) > VIDEO_PSNR_DB:
-                    yield case.finding(seen.dataset, f"{seen.view} of step {step} shows {other}", "its own camera")
+            for view in case.stored.keys() - {seen.view}:
+                if cv2.PSNR(frame, case.stored[view].grey[step]) > VIDEO_PSNR_DB:
+                    yield case.finding(seen.dataset, f"{seen.view} of step {step} shows {view}", "its own camera")
 
 
 def alive(case: Case) -> Iterator[Fault]:
-    """No view that shows nothing, or the same all along."""
+    """Check that no view has a blank frame or stays constant."""
     for seen in case.seen:
         first, *_ = frames = [*seen.frames.values()]
         if min(cv2.meanStdDev(frame.reshape(-1))[1].item() for frame in frames) < BLANK_LEVELS:
@@ -196,21 +213,25 @@ def alive(case: Case) -> Iterator[Fault]:
 
 
 def gripper(case: Case) -> Iterator[Fault]:
-    """Commands of -1 and +1, and fingers that part on the one and close on the other."""
-    told = SCHEMA.action.gripper
+    """Check that commands are -1 or +1, and that the fingers open and close accordingly."""
+    commands = SCHEMA.action.gripper
     for copy in case.whole:
         command, state = copy.episode.action[:, 6], copy.episode.state
-        if other := told.others(command):
-            yield case.finding(copy.dataset, f"gripper command {min(other)}", f"{told.open} or {told.close}")
+        strange = commands.others(command)
+        if strange:
+            yield case.finding(copy.dataset, f"gripper command {min(strange)}", f"{commands.open} or {commands.close}")
         gap = state[:, 6] - state[:, 7]
-        opened = float((np.sign(command[:-1] * told.open) * np.diff(gap)).sum())
+        opened = float((np.sign(command[:-1] * commands.open) * np.diff(gap)).sum())
         if opened < -AGAINST_M:
             what = f"fingers move {-opened:.3f} m against the gripper's command"
-            yield case.finding(copy.dataset, what, f"{told.open} opens, {told.close} closes")
+            yield case.finding(copy.dataset, what, f"{commands.open} opens, {commands.close} closes")
 
 
 def flags(case: Case) -> Iterator[Fault]:
-    """Where a dataset has such marks: the first and the last step, and a reward for the last of a success alone."""
+    """Check the marks of the first and last step, and the reward, which only the last step of a success has.
+
+    Marks that a dataset does not have are skipped.
+    """
     for copy in case.copies:
         step = np.arange(len(copy))
         last = step == len(step) - 1
@@ -220,7 +241,10 @@ def flags(case: Case) -> Iterator[Fault]:
 
 
 def clock(case: Case) -> Iterator[Fault]:
-    """Steps at the frame rate: of the physics, and counted from 0 and timed where a dataset has such marks."""
+    """Check that physics steps and timestamps keep the frame rate, and that frames are counted from 0.
+
+    Timestamps and frame numbers are skipped if a dataset does not have them.
+    """
     taken = np.diff(case.trajectory.states[:, 0])
     if not np.allclose(taken, 1 / SCHEMA.fps_hz, rtol=0, atol=1e-6):
         yield case.finding("frames", f"steps take {taken.min():g} to {taken.max():g} s", f"{1 / SCHEMA.fps_hz:g} s")
@@ -230,26 +254,29 @@ def clock(case: Case) -> Iterator[Fault]:
 
 
 def statistics(case: Case) -> Iterator[Fault]:
-    """Statistics of each episode: of its numbers, computed again, and of its frames, by the stored frames."""
+    """Compare each episode's statistics with its numbers, and those of its views with the stored frames."""
     for copy in case.whole:
-        if (found := copy.statistics) is None:
+        statistics = copy.statistics
+        if statistics is None:
             continue
+        stored, quantiles = statistics.stored, statistics.quantiles
         wrong: list[tuple[str, str]] = []
-        if found.stored.keys() != found.numbers.keys() | {*found.views.values()}:
-            wrong.append((f"states the columns {sorted(found.stored)}", f"{sorted(found.numbers)} and the views"))
-        figures = (*FIGURES, *found.quantiles)
-        for column, values in found.numbers.items():
-            stated = found.stored.get(column, {})
+        if stored.keys() != statistics.numbers.keys() | {*statistics.views.values()}:
+            wrong.append((f"states the columns {sorted(stored)}", f"{sorted(statistics.numbers)} and the views"))
+        figures = (*FIGURES, *quantiles)
+        for column, values in statistics.numbers.items():
+            stated = stored.get(column, {})
             lacking = [*complete(column, stated, figures, values.shape[1])]
-            wrong += lacking or wrong_numbers(column, stated, values, found.quantiles)
-        for view, column in found.views.items():
-            stated = found.stored.get(column, {})
-            if lacking := [*complete(column, stated, figures, 3)]:
+            wrong += lacking or wrong_numbers(column, stated, values, quantiles)
+        for view, column in statistics.views.items():
+            stated = stored.get(column, {})
+            lacking = [*complete(column, stated, figures, 3)]
+            if lacking:
                 wrong += lacking
                 continue
             wrong += wrong_sample(column, stated, case.sampled_levels[view], len(case.made))
             if case.witness:
-                wrong += wrong_pixels(column, stated, case.levels[view], found.quantiles)
+                wrong += wrong_pixels(column, stated, case.levels[view], quantiles)
         for what, expected in wrong:
             yield case.finding(copy.dataset, what, expected)
 
@@ -263,7 +290,7 @@ def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Itera
 
 
 def _same(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
-    """Bit for bit; None is the same as None alone."""
+    """Compare two arrays bit for bit; `None` equals only `None`."""
     if one is None or other is None:
         return one is other
     return (one.shape, one.dtype, one.tobytes()) == (other.shape, other.dtype, other.tobytes())

@@ -1,4 +1,4 @@
-"""Whether a folder of demonstrations can be used: every file is read, and some of each file are replayed."""
+"""Checks of a folder of demonstrations: every file is read, and some demonstrations of each file are replayed."""
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,12 +25,12 @@ LAYOUT = "<suite>/<task>_demo.hdf5, with a suite of LIBERO's or of one's own, wh
 
 @dataclass
 class Found:
-    """What a check came to.
+    """The result of a check.
 
     Attributes:
-        faults: each names its file, its demonstration where it is about one, and what to do.
-        missed: demonstrations whose replay misses the goal, though another of their file does not.
-        notes: what a run uses otherwise than a file's author may expect.
+        faults: errors; each names its file, its demonstration if it is about a single one, and a remedy.
+        missed: demonstrations whose replay misses the goal, while another one of the file reaches it.
+        notes: contents of files that a run uses in a way which their author may not expect.
     """
 
     files: int = 0
@@ -44,12 +44,12 @@ class Found:
 def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayConfig()) -> Found:  # noqa: B008 - frozen
     """Read every HDF5 file below a folder, and replay some demonstrations of each.
 
-    A replay that misses its goal is a fault where all of its file do: of good demonstrations a few miss.
+    A replay that misses its goal is a fault only if all replays of its file miss: a few good demonstrations miss, too.
 
     Args:
         root: folder with ``<suite>/<task>_demo.hdf5``.
-        run: spreads the work; one call for each file.
-        replay: the settings of the run that the demonstrations are for.
+        run: workers, which get one call for each file.
+        replay: settings of the run that will use the demonstrations.
 
     Raises:
         PipelineError: when there is no file, or a clone is imported in place of a package.
@@ -58,28 +58,28 @@ def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayC
     files = [root / name for name in sorted(glob("**/*.hdf5", root_dir=root, recursive=True))]
     if not files:
         raise PipelineError("there is no HDF5 file", where=root, expected=LAYOUT)
-    found, jobs = Found(len(files)), []
+    result, jobs = Found(len(files)), []
     for file in files:
         try:
             task = _task_of(file, root)
             reject_test_tasks([task])
             jobs.append(_FileJob(root, task, replays, replay))
         except PipelineError as error:
-            found.faults.append(str(error))
+            result.faults.append(str(error))
     work = Expendable(_FileJob.__call__, _FileJob.limit_s, _FileJob.lost)
     first_with: dict[str, DemoEntry] = {}
     for entries, of_file in run(work, jobs, "files"):
-        found.demonstrations += len(entries)
-        found.replayed += of_file.replayed
-        found.faults += of_file.faults
-        found.missed += of_file.missed
-        found.notes += of_file.notes
+        result.demonstrations += len(entries)
+        result.replayed += of_file.replayed
+        result.faults += of_file.faults
+        result.missed += of_file.missed
+        result.notes += of_file.notes
         for entry in entries:
             first = first_with.setdefault(entry.sha256, entry)
             if first.demo_id != entry.demo_id:
                 remedy = "leave the task of one of the two out of demos.tasks"
-                found.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: {remedy}")
-    return found
+                result.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: {remedy}")
+    return result
 
 
 def _task_of(file: Path, root: Path) -> Task:
@@ -105,7 +105,7 @@ class _FileJob:
 
     def __call__(self) -> _Result:
         index = HDF5Source(self.root).index([self.task])
-        # Of the other files of the suite, their own check tells.
+        # The other files of the suite are reported by their own checks.
         faults = [str(problem.error) for problem in index.problems if f"{problem.name}/".startswith(f"{self.task}/")]
         if not index.entries and not faults:
             expected = "groups data/demo_<number>"
@@ -122,12 +122,12 @@ class _FileJob:
         return index.entries, Found(replayed=len(chosen), faults=faults, missed=missed, notes=notes)
 
     def _chosen(self, entries: Sequence[DemoEntry]) -> list[DemoEntry]:
-        """The first, the last and others evenly between them."""
+        """Choose the first and the last demonstration, and further ones evenly between them."""
         count = min(self.replays, len(entries))
         return [entries[round(k * (len(entries) - 1) / max(count - 1, 1))] for k in range(count)]
 
     def _replayed(self, entries: Sequence[DemoEntry], replay: ReplayConfig) -> dict[DemoEntry, str]:
-        """Each demonstration's verdict under some settings."""
+        """Replay demonstrations under the given settings; return the reason of each verdict."""
         demos = DemosConfig(root=self.root)
         with tempfile.TemporaryDirectory() as folder:
             rows = twins(entries, 0, replay)
@@ -139,12 +139,12 @@ class _FileJob:
         return str(PipelineError(f"not replayed ({reason})", where=self._place(entry), expected=expected))
 
     def _missing(self, entries: Sequence[DemoEntry], reasons: Mapping[DemoEntry, str]) -> Iterator[str]:
-        """Say of each demonstration of a file whose replays all miss what was left out, and which settings help."""
+        """Report each demonstration of a file whose replays all miss, with dropped no-ops and settings that help."""
         working = []
-        for other in _other_settings(self.replay):
-            kept = sum(reason == "kept" for reason in self._replayed(entries, other).values())
+        for settings in _other_settings(self.replay):
+            kept = sum(reason == "kept" for reason in self._replayed(entries, settings).values())
             if kept:
-                working.append(f"{_in_words(other)} ({kept} of {len(entries)} reach the goal)")
+                working.append(f"{_in_words(settings)} ({kept} of {len(entries)} reach the goal)")
         if working:
             expected = "settings of the run under which the demonstrations reach their goal"
             remedy = f"set {'; or '.join(working)}"
@@ -186,8 +186,10 @@ class _FileJob:
         return f"{self.root / entry.source.split()[0]} data/{entry.key}"
 
     def limit_s(self) -> float:
-        """So long it may take before it counts as hanging; a replay takes about a minute at most, and there are up to
-        four for each demonstration."""
+        """Return the time after which the job counts as hanging.
+
+        A replay takes about a minute at most, and each demonstration has up to four replays.
+        """
         return 1800.0 + 4 * 600.0 * self.replays
 
     def lost(self) -> _Result:
@@ -195,20 +197,20 @@ class _FileJob:
 
 
 def _is_refused(reason: str) -> bool:
-    """Whether a demonstration came to no verdict on its goal."""
+    """Return whether a demonstration has no verdict on its goal."""
     return reason != "kept" and reason not in MISSED
 
 
 def _other_settings(replay: ReplayConfig) -> Iterator[ReplayConfig]:
-    """What else a run may set: all no-ops kept, tracking where open-loop replay fails, and both."""
+    """Yield other settings for a run: keep all no-ops, track if open-loop replay fails, and both."""
     changes: list[dict[str, object]] = [{"noops": "keep"}, {"mode": "auto"}, {"noops": "keep", "mode": "auto"}]
     tried = {replay}
     for change in changes:
-        other = replay.model_copy(update=change)
-        # Tracking is what auto does where open-loop replay fails.
-        if other not in tried and not (replay.mode == "tracked" and other.mode == "auto"):
-            tried.add(other)
-            yield other
+        settings = replay.model_copy(update=change)
+        # If open-loop replay fails, auto tracks, which was tried already.
+        if settings not in tried and not (replay.mode == "tracked" and settings.mode == "auto"):
+            tried.add(settings)
+            yield settings
 
 
 def _in_words(replay: ReplayConfig) -> str:
@@ -216,5 +218,6 @@ def _in_words(replay: ReplayConfig) -> str:
 
 
 def _instruction_notes(task: Task) -> Iterator[str]:
-    if long := too_long(task.instruction):
-        yield f"{task}: {long}"
+    warning = too_long(task.instruction)
+    if warning:
+        yield f"{task}: {warning}"

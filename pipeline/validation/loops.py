@@ -1,6 +1,6 @@
-"""Have Numba compile all loops that a run uses, robosuite's and ours: python -m pipeline.validation.loops
+"""Compilation of all Numba loops that a run uses, robosuite's and ours: python -m pipeline.validation.loops
 
-``setup.sh`` does so once. Without it, each process that is the first to need a loop compiles it, several at a time.
+``setup.sh`` runs it once. Otherwise the processes that first need a loop compile it, several at a time.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from pipeline.run.machine import trial
 
 
 def compile_all() -> None:
-    """Call everything that is compiled; what was compiled before takes no time.
+    """Call every compiled function; functions that were compiled before take no time.
 
     Raises:
         PipelineError: when nothing renders on this machine.

@@ -1,11 +1,12 @@
-"""Disk and time that a run takes: from the lengths of its demonstrations, and from what a step was measured to take.
+"""Disk and time that a run takes, from the lengths of its demonstrations and from measured costs of a step.
 
-Every planned episode counts as kept, and so does the clean twin of every demonstration; each is as long as its
+Every planned episode counts as kept, and so does the clean twin of every demonstration. Each has as many steps as its
 demonstration.
 
 Sizes are rounded up from four runs of one demonstration of 90 steps (``benchmarks/disk.py``, see ``docs/cost.md``).
-Times of frames and replays are those of ``run/work_time.py``; the others are CPU times of one core of the same machine,
-of the stages of ``configs/starter.yaml`` and of a run of 1,004 episodes, which took 19 % less time than they say.
+Times of frames and replays come from ``run/work_time.py``. The other times are CPU times of one core of the same
+machine. They were measured with the stages of ``configs/starter.yaml``, and of a run of 1,004 episodes, which took 19 %
+less time than estimated.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
 MAP_KB: dict[Extra, float] = {"depth": 31.0, "segmentation": 3.0}
 """A view of one step."""
 POSES_KB, MOTION_KB = 0.7, 0.5
-"""One step: object poses; state, action and what else is beside the frames."""
+"""One step: object poses; state, action and all other columns except the frames."""
 VIDEO_KB = 15.0
 """One step in LeRobot, both views as video."""
 IN_TEXT = 1.2
-"""How much larger LeRobot's columns of base64 are than the PNG files in them."""
+"""Size of LeRobot's base64 columns as a multiple of the PNG files in them."""
 TRAJECTORY_KB, STATE_KB = 100.0, 1.2
 """A trajectory, and each step of it."""
 EPISODE_KB = 50.0
@@ -51,24 +52,24 @@ PUBLISHED = 50
 """Demonstrations of a task in LIBERO's files."""
 
 SHADOWS_S, SHADOWS = 0.13, 0.4
-"""What shadows add to a frame, and the share of the light episodes that have them."""
+"""Time that shadows add to a frame, and the share of the light episodes that have them."""
 MAPS_S = 0.045
-"""Depth or segmentation, or both, of a view of one step: rendered once more, and PNG files."""
+"""Depth, segmentation, or both, of a view of one step: a second rendering, and PNG files."""
 RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.0015, 0.0006
 """A step of an episode in the exports and in ``validate``."""
 FIXED_S = 100.0
-"""Starting the stages, previews, sheets and report: on the clock, however many workers there are."""
+"""Wall-clock time of starting the stages, previews, sheets and report, with any number of workers."""
 IN_TURN = ("rest", "GPU")
-"""What takes as long with more workers. A GPU renders for one process at a time: an H200 gave 770 frames a second to 4
-as to 16 of them, and 600 to one (`benchmarks/gpu.py`)."""
+"""Work that more workers do not speed up. A GPU renders for one process at a time: an H200 gave 770 frames a second to
+4 and to 16 processes, and 600 to one (`benchmarks/gpu.py`)."""
 
 
 def needed_mb(config: Config) -> dict[str, float]:
-    """Folder of a run to the megabytes that it takes."""
+    """Estimate the megabytes that each folder of a run takes."""
     amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
     twins, _, twin_steps, mean_steps = amounts
     export, (episodes, steps) = config.export, _exported(config, amounts)
-    # What planned episodes have that their twins do not: trajectories, and views of frames and of maps.
+    # Trajectories, and views of frames and of maps, that planned episodes do not share with their twins.
     trajectories = frames = maps = 0.0
     for _, number, kinds in _planned(config.plan):
         physics = any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
@@ -80,8 +81,8 @@ def needed_mb(config: Config) -> dict[str, float]:
     poses_kb = POSES_KB if "object_poses" in extras else 0.0
 
     def lerobot_kb(video: bool) -> float:
-        shown_kb = VIDEO_KB if video else views * frame_kb + MOTION_KB
-        return steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
+        step_kb = VIDEO_KB if video else views * frame_kb + MOTION_KB
+        return steps * (step_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
 
     needed_kb = {
         "trajectories": (twins + trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
@@ -99,18 +100,18 @@ def needed_mb(config: Config) -> dict[str, float]:
 
 
 def needed_s(config: Config, speed: Speed) -> dict[str, float]:
-    """Stage to the seconds that one core takes for it; under ``IN_TURN``, seconds that more cores do not make fewer.
+    """Estimate the seconds that one core takes for each stage; more cores do not reduce the entries in ``IN_TURN``.
 
-    Savings are taken to gain as much as on the reference machine. A GPU renders plainly and takes as long in every
-    arena.
+    Rendering optimizations count as gaining as much as on the reference machine. A GPU renders without them, and takes
+    equally long in every arena.
 
     Args:
-        config: of the run.
-        speed: of the machine.
+        config: configuration of the run.
+        speed: measured speed of the machine.
     """
     tasks = lengths(config.demos)
     amounts = Amounts.of(tasks, config.plan)
-    # To render a frame of each view: the mean over all demonstrations.
+    # Time to render a frame of each view: the mean over all demonstrations.
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
     drawn_s = np.average([FRAME_S[arena] for arena in arenas], axis=0, weights=weights)
     slower = speed.frame_s / REFERENCE.frame_s
@@ -140,14 +141,17 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
 
 
 def in_words(stages_s: Mapping[str, float], workers: int) -> str:
-    """Some stages' time on the clock, with so many cores."""
+    """Format the wall-clock time of stages for a number of workers."""
     times_s = {stage: s if stage in IN_TURN else s / workers for stage, s in stages_s.items()}
     parts = ", ".join(f"{stage} {_time(s)}" for stage, s in times_s.items())
     return f"about {_time(sum(times_s.values()))} with {workers} worker{'s' * (workers > 1)}: {parts}"
 
 
 def workers_of(compute: ComputeConfig) -> int:
-    """Processes that work at the same time; as many as this machine has cores, where a cluster elsewhere decides."""
+    """Return the number of processes that work at the same time.
+
+    A cluster elsewhere sets its own number; then the number of cores of this machine is returned.
+    """
     from dask.system import CPU_COUNT
 
     return 1 if compute.cluster == "loop" else compute.workers or CPU_COUNT
@@ -160,14 +164,22 @@ def _time(seconds: float) -> str:
 
 
 def free_gb(folder: Path) -> float:
-    """What is free where a folder is, or would be made."""
-    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
-    return shutil.disk_usage(there).free / 1e9
+    """Return the free space of the disk that has a folder, or would have it."""
+    existing = folder.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    return shutil.disk_usage(existing).free / 1e9
 
 
 class Amounts(NamedTuple):
-    """How many twins and planned episodes a run has, the steps of all twins, and those of a planned episode: the mean,
-    as episodes are spread evenly over the tasks."""
+    """The size of a run.
+
+    Attributes:
+        twins: number of clean twins.
+        planned: number of planned episodes.
+        twin_steps: steps of all twins.
+        mean_steps: mean steps of a planned episode; episodes are spread evenly over the tasks.
+    """
 
     twins: int
     planned: int
@@ -176,10 +188,10 @@ class Amounts(NamedTuple):
 
     @classmethod
     def of(cls, tasks: Mapping[Task, list[int]], plan: PlanConfig) -> Amounts:
-        """By the steps of each demonstration of each task (see ``lengths``)."""
-        found = list(tasks.values())
-        mean_steps = float(np.mean([np.mean(task) for task in found]))
-        return cls(sum(map(len, found)), sum(plan.episodes.values()), sum(map(sum, found)), mean_steps)
+        """Compute the size of a run from the steps of each demonstration of each task (see ``lengths``)."""
+        steps = list(tasks.values())
+        mean_steps = float(np.mean([np.mean(task) for task in steps]))
+        return cls(sum(map(len, steps)), sum(plan.episodes.values()), sum(map(sum, steps)), mean_steps)
 
     @property
     def steps(self) -> float:
@@ -187,19 +199,19 @@ class Amounts(NamedTuple):
 
 
 def _planned(plan: PlanConfig) -> Iterator[tuple[list[str], int, list[type[Perturbation]]]]:
-    """The axes that each wanted combination has, how many episodes are wanted of it, and the kinds of its draws."""
+    """Yield, for each combination, its axes, its wanted number of episodes, and the classes of its perturbations."""
     for name, episodes in plan.episodes.items():
         axes = list(axes_of(name))
         yield axes, episodes, [AXES[axis].draws[0] for axis in axes]
 
 
 def _seen_otherwise(kind: type[Perturbation]) -> bool:
-    """Whether it has maps of its own: it shows other surfaces than the twin does, or from elsewhere."""
+    """Return whether episodes have their own maps: they show other surfaces than the twin, or another viewpoint."""
     return issubclass(kind, PhysicsPerturbation) or (issubclass(kind, RenderPerturbation) and kind.sees_otherwise)
 
 
 def _exported(config: Config, amounts: Amounts) -> tuple[int, float]:
-    """Episodes and steps of a dataset; of ``export.where`` the axes count alone."""
+    """Estimate the episodes and steps of a dataset; only the axes of ``export.where`` are taken into account."""
     axes = config.export.where.axis if config.export.where else None
     planned = sum(number for name, number in config.plan.episodes.items() if axes is None or name in axes)
     twins, twin_steps = (amounts.twins, amounts.twin_steps) if axes is None or CLEAN in axes else (0, 0)
@@ -207,24 +219,26 @@ def _exported(config: Config, amounts: Amounts) -> tuple[int, float]:
 
 
 def lengths(demos: DemosConfig) -> dict[Task, list[int]]:
-    """Steps of each demonstration, by task; where no file is there yet, those of LIBERO's as long as the starter's.
+    """Return the steps of each demonstration, by task.
+
+    If no file exists yet, the demonstrations of LIBERO's tasks count as long as the starter set's.
 
     Raises:
-        PipelineError: when only own tasks are asked for, and none has a demonstration.
+        PipelineError: when only the user's own tasks are selected, and none has a demonstration.
     """
     starter = StarterSource()
     if demos.root is None:
         return {entry.task: [entry.steps] for entry in starter.index(select_tasks(demos.tasks)).entries}
     source = HDF5Source(demos.root)
-    found = {task: source.lengths(task)[: demos.per_task] for task in select_tasks(demos.tasks)}
-    if not any(found.values()):
-        of_libero = [task for task in found if task.suite in SUITES]
-        found = {task: [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED) for task in of_libero}
-    if not any(found.values()):
+    steps_of = {task: source.lengths(task)[: demos.per_task] for task in select_tasks(demos.tasks)}
+    if not any(steps_of.values()):
+        libero_tasks = [task for task in steps_of if task.suite in SUITES]
+        steps_of = {task: [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED) for task in libero_tasks}
+    if not any(steps_of.values()):
         raise PipelineError(
             "none of your own tasks has a demonstration",
             where=demos.root,
             expected="<suite>/<task>_demo.hdf5 there",
             remedy="see `python -m pipeline demos check`",
         )
-    return {task: steps for task, steps in found.items() if steps}
+    return {task: steps for task, steps in steps_of.items() if steps}

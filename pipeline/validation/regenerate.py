@@ -1,4 +1,4 @@
-"""Rebuild one episode from its row of the manifest and the demonstration, and say where it differs from the dataset's.
+"""Rebuilding of one episode from its row of the manifest and the demonstration, and comparison with the dataset.
 
 `python -m pipeline regenerate EPISODE_ID CONFIG --out FOLDER`
 """
@@ -34,21 +34,21 @@ from pipeline.types import Verdict
 
 
 def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | None = None) -> dict[str, Any]:
-    """Replay, render and serialise one kept episode again, and compare it with the dataset that lies by the manifest.
+    """Replay, render and serialise one kept episode again, and compare it with the dataset next to the manifest.
 
     Args:
-        manifest_file: of the run; its ``rlds`` folder is looked for beside it.
-        out: a new folder, which gets the replay, the frames, and the episode as an RLDS set of its own.
-        root: folder of LIBERO's HDF5 demonstrations, where the run started from those.
+        manifest_file: manifest of the run; the ``rlds`` folder is expected next to it.
+        out: a new folder for the replay, the frames, and the episode as an RLDS set of its own.
+        root: folder of LIBERO's HDF5 demonstrations, if the run started from them.
 
     Returns:
-        JSON-serialisable: ``identical`` (None when no dataset lies there), ``reason`` (``kept``, or what the replay or
-        the rendering came to this time), ``versions`` and ``gl_device`` where the manifest's are not those here, and
-        ``differs``, column to the steps or values that are not the same. This project's own version, which is in the
-        dataset too, makes no difference.
+        JSON-serialisable: ``identical`` (`None` without a dataset) and ``reason`` (``kept``, or why the replay or the
+        rendering was rejected this time). ``versions`` and ``gl_device`` list differences between the manifest and
+        this machine. ``differs`` maps columns to the steps or values that differ. This project's own version, which
+        the dataset also stores, is not compared.
 
     Raises:
-        PipelineError: when the manifest has no such kept episode, or its demonstration is not there or another.
+        PipelineError: when the manifest has no such kept episode, or its demonstration is missing or has changed.
     """
     rows = {row["episode_id"]: row for row in manifest.read(manifest_file)}
     row = rows.get(episode_id)
@@ -64,15 +64,16 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     differs = _differences(stored[1], rebuilt[1]) if stored and rebuilt else {}
     other_version = differs.pop(METADATA + manifest.OWN_VERSION, None) is not None
     same = stored and rebuilt and (rebuilt[0] == stored[0] or (other_version and not differs))
+    other_versions = {}
+    for name, here in versions().items():
+        recorded = row[manifest.version_column(name)]
+        if recorded != here:
+            other_versions[name] = {"manifest": recorded, "here": here}
     return {
         "episode_id": episode_id,
         "identical": bool(same) if stored else None,
         "reason": reason,
-        "versions": {
-            name: {"manifest": row[column], "here": here}
-            for name, here in versions().items()
-            if row[column := manifest.version_column(name)] != here
-        },
+        "versions": other_versions,
         "gl_device": {} if row["gl_device"] == device else {"manifest": row["gl_device"], "here": device},
         "differs": differs,
     }
@@ -82,17 +83,21 @@ _Record = tuple[bytes, dict[str, NDArray[Any]]]
 
 
 def _record(shard: Path, index: int) -> _Record:
-    """An episode as it lies in a shard: the serialised example, and its columns."""
+    """Read an episode of a shard: the serialised example, and its columns."""
     data = record_at(shard, index)
     if data is None:
         raise PipelineError(f"has no record {index}", where=shard, expected="as many as the manifest says")
     return data, columns(data, tfds.builder_from_directory(shard.parent).info.features)
 
 
+def _plan_row(row: Row) -> plan.Row:
+    return plan.Row(**{column.name: row[column.name] for column in fields(plan.Row)})
+
+
 def _rebuild(
     row: Row, twin: Row, settings: manifest.Settings, out: Path, root: Path | None
 ) -> tuple[_Record | None, str]:
-    """The episode made again below ``out``, or None and the reason when it does not come to be kept this time."""
+    """Generate the episode again below ``out``; return `None` and the reason if it is not kept this time."""
     if (settings.source == "hdf5") != (root is not None):
         raise PipelineError(
             f"the run's demonstrations are of the source {settings.source}",
@@ -107,23 +112,22 @@ def _rebuild(
             expected=f"content with the hash {row['demo_sha256']}",
         )
     trajectories, frames = out / "trajectories", out / "frames"
-    planned, planned_twin = (
-        plan.Row(**{column.name: each[column.name] for column in fields(plan.Row)}) for each in (row, twin)
-    )
+    planned, planned_twin = _plan_row(row), _plan_row(twin)
     plan.write([planned], out / "plan.parquet")
 
     def replay(each: plan.Row) -> Verdict:
         return ReplayJob(each, planned_twin.trajectory_id, demos, settings.replay, trajectories)()
 
     if settings.replay.mode != "open_loop" and planned_twin.trajectory_id != planned.trajectory_id:
-        # Tracking follows what the twin did.
+        # Tracking follows the twin's trajectory.
         replay(planned_twin)
     verdict = replay(planned)
     if not verdict.kept:
         return None, verdict.reason
     streams = tuple(streams_of(planned.perturbations).values())
     RenderJob(planned, streams, trajectories, frames, settings.render, gl.choose().device)()
-    if rejected := shown_of(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected:
+    rejected = shown_of(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected
+    if rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(out, settings.render)
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)
@@ -133,19 +137,19 @@ def _rebuild(
 
 
 def _differences(stored: Mapping[str, NDArray[Any]], rebuilt: Mapping[str, NDArray[Any]]) -> dict[str, str]:
-    found = {}
+    differences = {}
     for name in sorted({*stored, *rebuilt}):
         if name not in stored or name not in rebuilt:
-            found[name] = "only in the dataset" if name in stored else "only in what was rebuilt"
+            differences[name] = "only in the dataset" if name in stored else "only in what was rebuilt"
             continue
         there, here = stored[name], rebuilt[name]
         off = [step for step, pair in enumerate(zip(there, here, strict=False)) if not np.array_equal(*pair)]
         if len(there) != len(here):
-            found[name] = f"{len(there)} steps in the dataset, {len(here)} rebuilt"
+            differences[name] = f"{len(there)} steps in the dataset, {len(here)} rebuilt"
         elif off and not name.startswith(METADATA):
-            found[name] = f"{len(off)} of {len(here)} steps, the first at step {off[0]}"
+            differences[name] = f"{len(off)} of {len(here)} steps, the first at step {off[0]}"
         elif off and isinstance(there[0], bytes):
-            found[name] = f"{there[0].decode()!r} in the dataset, {here[0].decode()!r} rebuilt"
+            differences[name] = f"{there[0].decode()!r} in the dataset, {here[0].decode()!r} rebuilt"
         elif off:
-            found[name] = "other numbers"
-    return found
+            differences[name] = "other numbers"
+    return differences

@@ -1,7 +1,7 @@
-"""Some episodes rendered anew: is what the store and the datasets have the right picture, and the right way up?
+"""Comparison of stored frames with new renderings of some episodes: is it the right picture, and the right way up?
 
-The process is another than the one that rendered the frames, and the pictures are made from the trajectory's states.
-Noise and turning are done here once more, by other code than that of the run (``rendering/render.py``).
+Another process than the one that rendered the frames renders them again, from the trajectory's states. Noise and
+rotation are applied by code of this module, not by the run's (``rendering/render.py``).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,27 +21,27 @@ from pipeline.types import Frame
 from pipeline.validation.case import Case
 
 PSNR_DB = 25.0
-"""Least PSNR of a frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""
+"""Least PSNR of a frame to a fresh rendering: far below the PSNR after JPEG, far above the PSNR of another frame."""
 
 BEFORE = 5
-"""A frame that came late would show what is so many steps before; in fewer, little moves."""
+"""Steps by which a delayed frame is assumed to be late; in fewer steps, little moves."""
 
 
 def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The clean episode of every task, and one episode of every axis and combination."""
-    chosen = {
-        (row["suite"], row["task"]) if row["role"] == "twin" else row["axis"]: row["episode_id"]
-        for row in rows
-        if row["kept"]
-    }
+    """Choose a clean episode of every task, and one episode of every axis and combination."""
+    chosen: dict[object, str] = {}
+    for row in rows:
+        if row["kept"]:
+            group = (row["suite"], row["task"]) if row["role"] == "twin" else row["axis"]
+            chosen[group] = row["episode_id"]
     return list(chosen.values())
 
 
 def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fault]:
-    """The first and the middle frame of every view, against fresh renderings turned by numpy, as they are not there.
+    """Compare the first and the middle frame of every view with fresh renderings, which numpy rotates.
 
-    Where the same device renders, the stored frame must be the same file. On another, and in the datasets, the fresh
-    rendering must be the nearest of all pictures that may have taken its place.
+    If the same device renders, the stored frame must be the same file. On another device, and in the datasets, the
+    fresh rendering must be the nearest of all pictures that could have been stored by mistake.
     """
     exact = case.row["gl_device"] == gl.choose().device
     for step in dict.fromkeys((0, len(case.made) // 2)):
@@ -69,19 +69,19 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
 def _nearest(
     frame: Frame, right: str, view: str, fresh: Mapping[str, Frame], former: Frame | None
 ) -> tuple[str, float]:
-    could_be = {
+    candidates = {
         right: _turned(fresh[view]),
         f"{view} not turned": fresh[view],
         f"{view} upside down": fresh[view][::-1],
         f"{view} mirrored": fresh[view][:, ::-1],
         "a black frame": np.zeros_like(frame),
-        **{f"{other}, turned": _turned(raw) for other, raw in fresh.items() if other != view},
+        **{f"{name}, turned": _turned(raw) for name, raw in fresh.items() if name != view},
     }
     if former is not None:
-        could_be[f"{view} of {BEFORE} steps before"] = _turned(former)
-    reached = {name: float(cv2.PSNR(frame, np.ascontiguousarray(one))) for name, one in could_be.items()}
-    nearest = max(reached, key=reached.__getitem__)
-    return nearest, reached[nearest]
+        candidates[f"{view} of {BEFORE} steps before"] = _turned(former)
+    psnr_db = {name: float(cv2.PSNR(frame, np.ascontiguousarray(image))) for name, image in candidates.items()}
+    nearest = max(psnr_db, key=psnr_db.__getitem__)
+    return nearest, psnr_db[nearest]
 
 
 def _turned(raw: Frame) -> Frame:
@@ -89,7 +89,7 @@ def _turned(raw: Frame) -> Frame:
 
 
 def _raw(case: Case, opened: LastScene, step: int) -> dict[str, Frame]:
-    """View to its frame before a step, in the orientation of LIBERO's raw observations."""
+    """Render the frame of each view before a step, in the orientation of LIBERO's raw observations."""
     renderer, changes = opened.renderer(case.trajectory.model_xml), from_json(case.row["perturbations"])
     with renderer.perturbed(of_layer(changes, RenderPerturbation)):
         renderer.restore(case.trajectory.states[step], case.trajectory.site_alpha[step])

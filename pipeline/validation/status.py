@@ -1,4 +1,4 @@
-"""Where a run stands: what is kept of what is wanted, what would run and why, and the disk. Nothing is changed."""
+"""The state of a run: kept and wanted episodes, stages that would run and why, and the disk. Nothing is changed."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,11 +39,11 @@ MADE = {
     "recipe": [FINETUNE],
     "card": [CARD],
 }
-"""Stages that remember nothing, to what they make."""
+"""Outputs of the stages that keep no record of their inputs, by stage."""
 
 
 def told(run: Run) -> Iterator[str | Table]:
-    """A run's state in a few paragraphs and tables."""
+    """Yield a run's state as a few paragraphs and tables."""
     config = run.config
     yield f"run {run.name}, in {run.folder}"
     try:
@@ -60,7 +60,7 @@ def told(run: Run) -> Iterator[str | Table]:
     if steps:
         yield "would run:"
         yield from (f"  {step}: {why}" for step, why in steps.items())
-    # Until all is replayed and rendered, what is not known is hoped for.
+    # Until all episodes are replayed and rendered, undecided candidates count as kept, so nothing is short.
     if not steps.keys() & {"plan", "replay", "render"}:
         missing = counts.shortfalls(_targets(config, rows, judged))
         yield from missing
@@ -71,9 +71,9 @@ def told(run: Run) -> Iterator[str | Table]:
         yield f"no longer needed, and deleted by a run with REMAKE=1, without which it stops: {unneeded}"
     yield from edits_in_words(run.folder)
     yield _disk(run)
-    # What is not replayed yet is hoped for.
-    hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
-    needed = [row for row in rows if row.episode_id in hopes]
+    # Count undecided candidates as kept until they are replayed.
+    possible = {key for key, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
+    needed = [row for row in rows if row.episode_id in possible]
     yield from _time_left(run, needed, verdicts, frames, steps) if steps else ()
 
 
@@ -117,12 +117,14 @@ def _steps(
     if of_plan:
         yield "plan", _why_planned(run)
     made_anew = outdated(rows, run.trajectories, run.frames)
-    if needed := selection.pending(rows, verdicts, rejected):
+    needed = selection.pending(rows, verdicts, rejected)
+    if needed:
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
     judged = selection.select(rows, verdicts, rejected)
-    shown = [row for row in rows if judged[row.episode_id].kept]
-    shown += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
-    if missing := [row for row in shown if not outcome.rendered(row, frames)]:
+    to_render = [row for row in rows if judged[row.episode_id].kept]
+    to_render += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
+    missing = [row for row in to_render if not outcome.rendered(row, frames)]
+    if missing:
         yield "render", f"the frames of {len(missing)} episodes are not there" + _of(made_anew, "files of frames")
     if needed or missing or of_plan:
         yield "exports and all that follows", "their episodes are not all there" if needed or missing else "a new plan"
@@ -132,22 +134,26 @@ def _steps(
 
 def _follow(run: Run) -> Iterator[tuple[str, str]]:
     for stage, names in MADE.items():
-        if gone := [name for name in names if not run.path(name).exists()]:
+        gone = [name for name in names if not run.path(name).exists()]
+        if gone:
             yield stage, f"{gone[0]} is not there"
         elif any(edits(run.path(name)) for name in names if name in FOLDERS):
             yield stage, "stops before it overwrites edits"
-        elif stage == "card" and (stated := _changed_statements(run)):
-            yield stage, f"another configuration: {', '.join(stated)}"
+        elif stage == "card":
+            statements = _changed_statements(run)
+            if statements:
+                yield stage, f"another configuration: {', '.join(statements)}"
     stale = False
-    for one in (*run.formats, *(run.failure_formats if run.outcome.missed else ())):
-        episodes = export.episodes_of(one, run)
-        if not export.untouched(one):
+    for dataset in (*run.formats, *(run.failure_formats if run.outcome.missed else ())):
+        episodes = export.episodes_of(dataset, run)
+        if not export.untouched(dataset):
             why = "there is no dataset, or files of it have changed"
-        elif one.record().identity != export.identity(one, episodes):
-            why = f"the dataset has {next(iter(export.outdated(one, episodes)), 'files of other episodes or options')}"
+        elif dataset.record().identity != export.identity(dataset, episodes):
+            reason = next(iter(export.outdated(dataset, episodes)), "files of other episodes or options")
+            why = f"the dataset has {reason}"
         else:
             continue
-        yield f"export_{one.stage_record.stem}", f"{one.title}: {why}"
+        yield f"export_{dataset.stage_record.stem}", f"{dataset.title}: {why}"
         stale = True
     if stale:
         yield "manifest and all that follows", "the datasets are not those"
@@ -161,20 +167,21 @@ def _follow(run: Run) -> Iterator[tuple[str, str]]:
 def _why_planned(run: Run) -> str:
     changed = _changed(run.path(SETTINGS), inputs.settings(run.config))
     of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
-    if files := sorted(_changed(run.path(INPUTS), inputs.listing(run.config))):
+    files = sorted(_changed(run.path(INPUTS), inputs.listing(run.config)))
+    if files:
         of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
     # The stage `inputs` wrote the new settings down before a plan was rejected.
     return f"another configuration: {', '.join(of_plan)}" if of_plan else "made from other settings, files or versions"
 
 
 def _changed_statements(run: Run) -> list[str]:
-    """Fields of the section ``publish`` that differ from those that the card was generated with."""
+    """List the fields of the section ``publish`` that have changed since the card was generated."""
     changed = _changed(run.path(SETTINGS), inputs.settings(run.config))
     return [name for name in changed if name.split(".")[0] == "publish"]
 
 
 def _changed(file: Path, now: Mapping[str, Any]) -> list[str]:
-    """Names of what is not as the file has it; none where there is no such file."""
+    """List the names whose values differ from the file's; without a file, the list is empty."""
     try:
         before = read_json(file)
     except PipelineError:
@@ -202,14 +209,15 @@ def _time_left(
     frames: Mapping[str, Shown],
     steps: Mapping[str, str],
 ) -> Iterator[str]:
-    """By the speed that ``doctor`` found, what the needed rows lack, and what would run."""
+    """Estimate the time left, from the speed that ``doctor`` measured, the needed rows and the stages to run."""
     speed = machine.known_speed(run)
     if speed is None or not needed:
         return
-    anew = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
+    exports = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
+    validates = exports or any(step.startswith(("manifest", "validate")) for step in steps)
     left = not_made(needed, verdicts, frames) | {
-        "export": float(anew),
-        "validate": float(anew or any(step.startswith(("manifest", "validate")) for step in steps)),
+        "export": float(exports),
+        "validate": float(validates),
     }
     left["GPU"] = left["render"]
     left_s = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(run.config, speed).items()}
@@ -219,9 +227,14 @@ def _time_left(
 def not_made(
     needed: Sequence[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, Shown]
 ) -> dict[str, float]:
-    """Shares in [0, 1] of what ``replay`` and ``render`` do for these rows; what several rows share counts once."""
+    """Return the shares in [0, 1] of the trajectories and streams that ``replay`` and ``render`` still have to do.
+
+    Trajectories and streams that several rows share count once.
+    """
     trajectories = {row.trajectory_id for row in needed}
-    streams = {(row.trajectory_id, one.stream_id) for row in needed for one in streams_of(row.perturbations).values()}
+    streams = set()
+    for row in needed:
+        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations).values()}
     rendered = {(trajectory, stream) for trajectory, shown in frames.items() for stream in shown.streams}
     return {
         "replay": len(trajectories - verdicts.keys()) / len(trajectories),

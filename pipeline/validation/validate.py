@@ -1,6 +1,6 @@
-"""Reopen the datasets and the manifest of a finished run, as their readers would, and say what is off.
+"""Validation of a finished run: its datasets and its manifest are opened again as their readers would open them.
 
-The datasets are compared with the stores that they were made from; those in turn are held against fresh renderings.
+The datasets are compared with the stores that they were made from, and the stores with fresh renderings.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import rendered, witnesses
 
 WHOLE = 4
-"""So many of the episodes that are rendered anew have all frames decoded, for the statistics of their views."""
+"""Number of re-rendered episodes of which all frames are decoded, for the statistics of their views."""
 
 SLICE = 16
-"""So many episodes are checked in one call, where no scene has to be opened for them."""
+"""Number of episodes that are checked in one call if no scene has to be opened for them."""
 
 
 @dataclass
 class Results:
-    """What checks came to, over any number of episodes.
+    """The results of checks, over any number of episodes.
 
     Attributes:
-        checked: check to how often it was made.
-        findings: check to what it found.
+        checked: check to the number of times that it was run.
+        findings: check to the errors that it found.
     """
 
     checked: Counter[str] = field(default_factory=Counter)
@@ -60,18 +60,19 @@ class Results:
         self.findings[check] += found
 
     def add(self, other: Results, within: str = "") -> None:
-        """Take over what others came to; ``within`` comes before the names of their datasets."""
+        """Add other results; ``within`` is put in front of the names of their datasets."""
         for check, checked in other.checked.items():
-            found = [replace(fault, dataset=within + fault.dataset) for fault in other.findings[check]]
-            self.note(check, found, checked)
+            faults = [replace(fault, dataset=within + fault.dataset) for fault in other.findings[check]]
+            self.note(check, faults, checked)
 
 
 def validate(run: Run, workers: Workers) -> dict[str, Any]:
     """Check a finished run; memory holds one episode in each worker, and the manifest.
 
     Returns:
-        JSON-serialisable: check to how many episodes (or planned rows, or datasets) were ``checked``, and
-        ``findings``, each with ``dataset``, ``episode`` (None when it is about the whole), ``what`` and ``expected``.
+        JSON-serialisable: for each check, the number of episodes (or planned rows, or datasets) that were ``checked``,
+        and ``findings``. Each finding has ``dataset``, ``episode`` (`None` if it is about the whole), ``what`` and
+        ``expected``.
 
     Raises:
         PipelineError: when the manifest or the stores cannot be read.
@@ -98,30 +99,30 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
                 total.add(_datasets(job, failed, workers), within=f"{registry.FAILURES}/")
         finally:
             scene_of_process().close()
-    return {
-        check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
-        for check, checked in total.checked.items()
-    }
+    report = {}
+    for check, checked in total.checked.items():
+        report[check] = {"checked": checked, "findings": [asdict(fault) for fault in total.findings[check]]}
+    return report
 
 
 def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
-    """The checks of some datasets, each as a whole, and of their episodes; ``job`` has all datasets."""
+    """Check datasets, each as a whole, and their episodes; ``job`` has all datasets."""
     total = Results()
-    files = [file for one in job.formats for file in one.written()]
+    files = [file for dataset in job.formats for file in dataset.written()]
     for faults in workers(Written.faults, files, "checksums"):
         total.note("checksums", faults)
-    # What changed files seem to hold is of no interest, and may be anything.
+    # Datasets with changed files are not checked further, as their content may be anything.
     changed = {fault.dataset for fault in total.findings["checksums"]}
-    unchanged = [one for one in job.formats if one.name not in changed]
-    # In workers, which read the episodes with the same packages later.
+    unchanged = [dataset for dataset in job.formats if dataset.name not in changed]
+    # Workers open the datasets, because they read the episodes with the same packages later.
     closed = workers(_closed, unchanged, "open")
     total.note("readable", [fault for fault in closed if fault], 0)
-    job = replace(job, formats=[one for one, fault in zip(unchanged, closed, strict=True) if not fault])
-    # Together, and lerobot, which takes longest, before RLDS: the other workers go on with the episodes.
-    work: list[Callable[[], Results]] = [
-        partial(_as_a_whole, one, episodes, job.cache) for one in reversed(job.formats)
-    ]
-    if "outcome" not in job.extras and any(one.name == "rlds" for one in job.formats):
+    job = replace(job, formats=[dataset for dataset, fault in zip(unchanged, closed, strict=True) if not fault])
+    # LeRobot, which takes longest, comes before RLDS; the other workers continue with the episodes.
+    work: list[Callable[[], Results]] = []
+    for dataset in reversed(job.formats):
+        work.append(partial(_as_a_whole, dataset, episodes, job.cache))
+    if "outcome" not in job.extras and any(dataset.name == "rlds" for dataset in job.formats):
         statistics = read_json(job.run.path(STATISTICS))
         work += [partial(_openvla_oft, statistics, folder) for folder in datasets(job.run.dataset("rlds").folder)]
     work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
@@ -130,20 +131,23 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
     return total
 
 
-def _closed(one: Format[Any]) -> Fault | None:
+def _closed(dataset: Format[Any]) -> Fault | None:
     try:
-        one.open()
+        dataset.open()
     except PipelineError as error:
-        return _unreadable(one, error)
+        return _unreadable(dataset, error)
     return None
 
 
-def _unreadable(one: Format[Any], error: PipelineError) -> Fault:
-    return Fault(one.name, None, str(error), "a dataset that can be opened")
+def _unreadable(dataset: Format[Any], error: PipelineError) -> Fault:
+    return Fault(dataset.name, None, str(error), "a dataset that can be opened")
 
 
 def _counts(run: Run) -> Iterator[Fault]:
-    """Every planned row in the manifest; no quota overfilled, and none left open while candidates are left."""
+    """Check that the manifest has every planned row, and that no quota is exceeded, or open while candidates are left.
+
+    The counts in ``counts.json`` must follow from the rows.
+    """
     planned, rows = [row.episode_id for row in run.plan], run.manifest
     if planned != [row["episode_id"] for row in rows]:
         yield Fault("manifest", None, f"{len(rows)} rows", f"the {len(planned)} of the plan, in its order")
@@ -158,15 +162,16 @@ def _counts(run: Run) -> Iterator[Fault]:
         yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
 
 
-def _as_a_whole(one: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:
-    results, found = Results(), []
+def _as_a_whole(dataset: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:
+    results, faults = Results(), []
     try:
-        for named in one.check(episodes, cache):
-            found.append(named)
+        # A loop, because faults that precede an error count.
+        for name_and_fault in dataset.check(episodes, cache):
+            faults.append(name_and_fault)
     except PipelineError as error:
-        results.note("readable", [_unreadable(one, error)], 0)
+        results.note("readable", [_unreadable(dataset, error)], 0)
     for check, checked in (("format", 1), ("ids", len(episodes)), ("splits", len(episodes)), ("readable", 0)):
-        results.note(check, [fault for named, fault in found if named == check], checked)
+        results.note(check, [fault for name, fault in faults if name == check], checked)
     return results
 
 
@@ -174,37 +179,36 @@ def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> Results:
     try:
         wrong = oft.check(folder, statistics)["violations"]
     except PipelineError as error:
-        wrong = [str(error)]  # The reader stops at what is damaged.
+        wrong = [str(error)]  # The reader stops at the first damaged file.
     results, name = Results(), folder.parent.name
-    results.note(
-        "openvla_oft", (Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in wrong)
-    )
+    faults = [Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in wrong]
+    results.note("openvla_oft", faults)
     return results
 
 
 def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[Format[Any]]) -> list[list[Row]]:
-    """All episodes, those that are checked in one call together.
+    """Group all episodes into slices, each of which is checked in one call.
 
-    Those to render anew come by trajectory and task, as those have a scene in common; the others as they lie in the
-    datasets.
+    Episodes to render again are grouped by trajectory, in the order of tasks, because they share a scene. The other
+    episodes follow in the order of the datasets.
     """
     rows = sorted(kept.values(), key=lambda row: (row["suite"], row["task"]))
     by_trajectory = grouped((row["trajectory_id"], row) for row in rows if row["episode_id"] in again)
     others = [row for row in rows if row["episode_id"] not in again]
-    # By LeRobot's files first, as theirs are the largest: the next episode lies in those that are open.
-    columns = [column.name for one in reversed(formats) for column in one.columns]
+    # LeRobot's files are the largest, so they decide first: the next episode is in a file that is open already.
+    columns = [column.name for dataset in reversed(formats) for column in dataset.columns]
     others.sort(key=lambda row: [(row[column] is None, row[column]) for column in columns])
     return [*by_trajectory.values(), *(others[start : start + SLICE] for start in range(0, len(others), SLICE))]
 
 
 @dataclass(frozen=True)
 class EpisodesJob:
-    """The checks of some episodes, wherever they lie.
+    """The checks of some episodes, in all places that store them.
 
     Attributes:
         formats: the datasets that can be opened.
-        cache: folder for files that reading them needs.
-        witnesses: ids of the episodes to render anew.
+        cache: folder for temporary files of the readers.
+        witnesses: ids of the episodes to render again.
         extras: ``outcome`` for failures.
     """
 
@@ -216,7 +220,7 @@ class EpisodesJob:
 
     def __call__(self, rows: Sequence[Row]) -> Results:
         results, rewrites = Results(), None
-        if any(one.language for one in self.formats):
+        if any(dataset.language for dataset in self.formats):
             language = self.run.config.plan.axes.language
             rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
         load = self.run.episodes(extras=self.extras, rewrites=rewrites)
@@ -228,16 +232,18 @@ class EpisodesJob:
         episode_id = row["episode_id"]
         copies = []
         results.note("readable", [])
-        for one in self.formats:
+        for dataset in self.formats:
             try:
-                if (copy := one.read(row, self.cache)) is not None:
-                    copies.append(copy)
-                else:
-                    missing = Fault(one.name, episode_id, "is not in the dataset", "every kept episode")
-                    results.note("ids", [missing], 0)
+                copy = dataset.read(row, self.cache)
             except PipelineError as error:
-                unreadable = Fault(one.name, episode_id, str(error), "an episode that can be read")
+                unreadable = Fault(dataset.name, episode_id, str(error), "an episode that can be read")
                 results.note("readable", [unreadable], 0)
+                continue
+            if copy is not None:
+                copies.append(copy)
+            else:
+                missing = Fault(dataset.name, episode_id, "is not in the dataset", "every kept episode")
+                results.note("ids", [missing], 0)
         try:
             made = load(episode_id)
             trajectory = self.run.trajectories.load(row["trajectory_id"])
@@ -245,7 +251,7 @@ class EpisodesJob:
             results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])
             return
         results.note("stored", [])
-        if "outcome" in self.extras:  # The manifest has figures of kept episodes alone.
+        if "outcome" in self.extras:  # The manifest has figures of kept episodes only.
             quality = measure(trajectory, find_task(row["suite"], row["task"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
         language = self.run.config.plan.axes.language

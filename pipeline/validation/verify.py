@@ -1,4 +1,4 @@
-"""Compare everything that a run stored with the checksums that it was stored with."""
+"""Comparison of all stored files of a run with the checksums that were recorded when they were written."""
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -19,33 +19,35 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
     """Read every stored file of a run: trajectories, frames, the datasets and the tables.
 
     Returns:
-        JSON-serialisable: the part of the run to how many files were ``checked``, and which are ``damaged`` or gone,
-        each with what to do about it.
+        JSON-serialisable: the part of the run to the number of ``checked`` files, and to the ``damaged`` or missing
+        files, each with a remedy.
     """
     results: dict[str, dict[str, Any]] = {}
     stores: dict[str, Store] = {"trajectories": run.trajectories, "frames": run.frames}
     for name, store in stores.items():
         there = store.names()
-        found = [*workers(partial(_damaged, store), there, name), *_gone(store, there)]
-        results[name] = _result(found)
-    for one in run.recorded_formats:
-        name = one.folder.relative_to(run.folder).as_posix()
+        damages = [*workers(partial(_damaged, store), there, name), *_gone(store, there)]
+        results[name] = _result(damages)
+    for dataset in run.recorded_formats:
+        name = dataset.folder.relative_to(run.folder).as_posix()
         try:
-            files = one.written()
+            files = dataset.written()
         except PipelineError as error:
             results[name] = {"checked": 0, "damaged": [str(error)]}
             continue
-        faults = workers(Written.faults, files, one.title)
-        results[name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
+        damages = []
+        for faults in workers(Written.faults, files, dataset.title):
+            damages.append([f"{fault.what}: {fault.expected}" for fault in faults])
+        results[name] = _result(damages)
     results["tables"] = _result(_unreadable(read) for read in _readers(run))
     if not any(result["damaged"] for result in results.values()):
-        # A file may be gone with the table that lists it; the plan still needs it.
+        # A file and the table that lists it may both be gone; the plan still needs the file.
         results["episodes"] = _result([_unreadable(lambda: run.outcome)])
     return results
 
 
 def _gone(store: Store, there: Sequence[str]) -> list[list[str]]:
-    """Find the files that a store's table lists and that are not there; nothing where there is no table."""
+    """Find the missing files that a store's table lists; without a table, the list is empty."""
     file = store.root / TABLE
     if not file.exists():
         return []
@@ -58,7 +60,7 @@ def _gone(store: Store, there: Sequence[str]) -> list[list[str]]:
 
 
 def _readers(run: Run) -> list[Callable[[], object]]:
-    """Functions that read each table of a run, which has no checksum."""
+    """Return functions that read the tables of a run, which have no checksums."""
     readers: list[Callable[[], object]] = [
         partial(plan.read, run.plan_file),
         partial(manifest.read, run.manifest_file),
@@ -86,5 +88,6 @@ def _damaged(store: Store, file: str) -> list[str]:
 
 
 def _result(findings: Iterable[Sequence[str]]) -> dict[str, Any]:
-    listed = list(findings)
-    return {"checked": len(listed), "damaged": [finding for found in listed for finding in found]}
+    """Summarize the findings of each checked file."""
+    of_files = list(findings)
+    return {"checked": len(of_files), "damaged": [finding for of_file in of_files for finding in of_file]}
