@@ -20,7 +20,7 @@ class BuildWithSchemas(build_py):
                 self.copy_file(file, str(folder))
 
     def get_source_files(self) -> list[str]:
-        """What a source distribution has to hold."""
+        """List the files that a source distribution has to hold."""
         return [*super().get_source_files(), *SCHEMAS]
 
 
