@@ -15,7 +15,7 @@ JOB_GB = round(4 / 3 * LARGEST_GB)
 
 
 class SlurmConfig(Frozen):
-    """What each worker asks SLURM for; fields that are left out have the value of the site's ``jobqueue.yaml``.
+    """Resources of each worker's SLURM job; fields that are left out have the value of the site's ``jobqueue.yaml``.
 
     Attributes:
         partition, account: of the site.
@@ -32,7 +32,7 @@ class SlurmConfig(Frozen):
 
 
 class ComputeConfig(Frozen):
-    """Where the work runs; it never changes the result.
+    """Place of the computation; it never changes the result.
 
     Attributes:
         cluster: ``local`` starts worker processes here, ``loop`` runs everything in this process, ``slurm`` has SLURM

@@ -33,7 +33,7 @@ CHECKOUT = (
 
 
 class DemosConfig(Frozen):
-    """Which demonstrations to start from.
+    """Demonstrations to start from.
 
     Attributes:
         source: ``starter`` for the 130 demonstrations that a Python package carries, ``hdf5`` for LIBERO's own files;
@@ -85,7 +85,7 @@ class DemosConfig(Frozen):
 
 
 class PlanConfig(Frozen):
-    """What to make of them.
+    """Episodes to plan from the demonstrations.
 
     Attributes:
         seed: every random draw of the run is keyed by it.
@@ -147,7 +147,7 @@ class PlanConfig(Frozen):
 
 
 class ReplayConfig(Frozen):
-    """How demonstrations are replayed.
+    """Options of the replay of demonstrations.
 
     Attributes:
         mode: ``open_loop`` sends the recorded actions as they are (the paper's way); ``tracked`` follows what the
@@ -167,7 +167,7 @@ class ReplayConfig(Frozen):
 
 
 class FilterConfig(Frozen):
-    """Which successful replays are dropped all the same, by the columns of the same names; none by default.
+    """Limits by which successful replays are dropped, named after columns of the manifest; no limits by default.
 
     An episode is dropped, with the column as its reason, where the figure is above the limit, or below it in
     ``joint_margin_rad``; then reserves take its place. Trajectories stay as they are.
@@ -196,7 +196,7 @@ class FilterConfig(Frozen):
 
 
 class RenderConfig(Frozen):
-    """How episodes are rendered; the size is that of ``schemas/episode.json``.
+    """Options of rendering; the size is that of ``schemas/episode.json``.
 
     Attributes:
         extras: what is made beside the frames, and put into all datasets: ``depth`` and ``segmentation`` of both views,

@@ -53,7 +53,7 @@ Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$", max_length=LONGEST_
 
 
 class RldsConfig(Frozen):
-    """How the RLDS sets are written.
+    """Options of the RLDS sets.
 
     Attributes:
         name: what the sets' names begin with; ``libero_`` and the name of the run when left out.
@@ -67,7 +67,7 @@ class RldsConfig(Frozen):
 
 
 class LeRobotConfig(Frozen):
-    """How the LeRobot dataset is written.
+    """Options of the LeRobot dataset.
 
     Attributes:
         name: of the dataset; ``libero_`` and the name of the run when left out.
@@ -105,7 +105,7 @@ CLEAN = "clean"
 
 
 class Where(Frozen):
-    """Which of the kept episodes are written: those whose value is listed, for each field that is not left out.
+    """Filter of the kept episodes: an episode is written if its value is listed in each field that is not left out.
 
     A clean twin has the axis and the component ``clean`` and the level 0.
 
@@ -131,7 +131,7 @@ class Where(Frozen):
 
 
 class LeRobotV21Config(Frozen):
-    """How LeRobot datasets of version 2.1 are written.
+    """Options of LeRobot datasets of version 2.1.
 
     Attributes:
         name: of the dataset, or what the sets' names begin with; ``libero_`` and the name of the run when left out.

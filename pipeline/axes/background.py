@@ -134,7 +134,7 @@ class BackgroundPerturbation(RenderPerturbation):
 
 
 class BackgroundAxis(Axis):
-    """What to draw from.
+    """Components and texture sources to sample from.
 
     Attributes:
         components: which of them, each as often as the other.

@@ -220,7 +220,7 @@ Aside = Literal["elevation", "distance", "turn", "yaw"]
 
 
 class AsideRange(Frozen):
-    """What keeps a draw clear of the test cameras: a second change, just larger than the clearance.
+    """Second change of a camera, just larger than the clearance, that keeps a perturbation clear of the test cameras.
 
     A test camera changes its distance, its place on the sphere or its turn in place, and leaves the other two alone.
 

@@ -100,7 +100,7 @@ class LayoutPerturbation(PhysicsPerturbation):
 
 
 class LayoutAxis(Axis):
-    """How many objects, and where from.
+    """Number and sources of added objects.
 
     The level is the number of objects, 1 to 5 as in LIBERO-Plus. An object is never of a category that is in the scene
     already or that the instruction names, nor of one that the test set adds. The same model may come twice, two models

@@ -113,7 +113,7 @@ class LightPerturbation(RenderPerturbation):
 
 
 class LightRange(Frozen):
-    """What one level draws from.
+    """Ranges of one level.
 
     Attributes:
         brightness_scale: multiple of the diffuse light, or else

@@ -6,7 +6,7 @@ from pipeline.types import Place
 
 
 class Folder(BaseModel, frozen=True, extra="forbid"):
-    """What the user has a right to use.
+    """Folder of textures or objects that the user has a right to use.
 
     Attributes:
         folder: for textures, searched with its subfolders for PNG and JPEG files; for objects, it holds
