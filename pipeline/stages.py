@@ -59,17 +59,19 @@ class Stage:
     """A step of a run.
 
     Attributes:
-        work: function that performs the stage. A stage without inputs runs every time and decides itself if work is
+        work: function that performs the stage. A stage without outputs runs every time and decides itself if work is
             left.
         settings: sections of ``settings.json`` that its outputs depend on.
         inputs: files and folders of the run that it reads.
         outputs: files and folders of the run that it writes.
+        memory: function that returns the memory of the last call, instead of one of settings, inputs and outputs.
     """
 
     work: Callable[[Run], None]
     settings: Sequence[str] = ()
     inputs: Sequence[str] = ()
     outputs: Sequence[str] = ()
+    memory: Callable[[Run], Memory] | None = None
 
 
 def write_inputs(run: Run) -> None:
@@ -114,9 +116,6 @@ def doctor(run: Run) -> None:
 
 def make_plan(run: Run) -> None:
     """Sample every perturbation of the run and write the plan, one row for each wanted episode."""
-    if plan_stage.is_up_to_date(run):
-        print("plan: up to date")
-        return
     rows = plan_stage.make(run.config)
     dropped.refuse_unasked(rows, run)
     for axis, number in plan.shortage(rows, run.config.plan).items():
@@ -305,7 +304,7 @@ _EXPORT = ("filter", "export")
 STAGES = {
     "inputs": Stage(write_inputs),
     "doctor": Stage(doctor, (*inputs.SECTIONS, "host"), (INPUTS,), (MACHINE,)),
-    "plan": Stage(make_plan),
+    "plan": Stage(make_plan, memory=plan_stage.memory),
     "leakage": Stage(check_leakage, (), (PLAN,), (LEAKAGE,)),
     "replay": Stage(replay, ("demos", "replay", "filter"), (INPUTS, MACHINE, PLAN, LEAKAGE), (REPLAY,)),
     "render": Stage(
@@ -343,13 +342,15 @@ def run_all(file: Path) -> Run:
     config = claimed(file)
     with locked(config.data):
         for number, name in enumerate(STAGES, start=1):
-            print(f"[{number}/{len(STAGES)}] {name}", flush=True)
-            perform(name, Run(config))
+            perform(name, Run(config), f"[{number}/{len(STAGES)}] {name}")
     return Run(config)
 
 
-def perform(name: str, run: Run) -> None:
+def perform(name: str, run: Run, title: str = "") -> None:
     """Perform a stage, unless its inputs and outputs are unchanged since the last call.
+
+    Args:
+        title: printed first; the name by default.
 
     Raises:
         PipelineError: when the stage stops.
@@ -357,8 +358,9 @@ def perform(name: str, run: Run) -> None:
     stage = STAGES[name]
     memory = _memory(name, run)
     if memory is not None and memory.holds():
-        print(f"{name}: up to date")
+        print(f"{title or name}: up to date", flush=True)
         return
+    print(title or name, flush=True)
     refuse_foreign_files(run.folder)
     stage.work(run)
     after = _memory(name, Run(run.config))
@@ -369,6 +371,8 @@ def perform(name: str, run: Run) -> None:
 def _memory(name: str, run: Run) -> Memory | None:
     """Return the memory of the stage's last call, `None` for a stage that runs every time."""
     stage = STAGES[name]
+    if stage.memory is not None:
+        return stage.memory(run)
     if not stage.outputs:
         return None
     settings = inputs.settings(run.config)

@@ -34,12 +34,12 @@ def make(config: Config) -> list[plan.Row]:
 def write(rows: Sequence[plan.Row], run: Run) -> None:
     """Write the plan, and remember the inputs that it was made from."""
     plan.write(rows, run.plan_file)
-    _memory(run).keep()
+    memory(run).keep()
 
 
 def is_up_to_date(run: Run) -> bool:
     """Return whether the run has the plan that the stage would write: same settings, files, library and packages."""
-    return _memory(run).holds()
+    return memory(run).holds()
 
 
 def upcoming(run: Run) -> Sequence[plan.Row]:
@@ -57,7 +57,8 @@ def upcoming(run: Run) -> Sequence[plan.Row]:
     return make(run.config) if any(file.exists() for file in written) else []
 
 
-def _memory(run: Run) -> Memory:
+def memory(run: Run) -> Memory:
+    """Return the memory of the stage: settings, the user's files, library and packages that the plan depends on."""
     config = run.config
     settings = inputs.settings(config)
     sections = {name: settings[name] for name in ("demos", "plan", "replay")}

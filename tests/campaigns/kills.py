@@ -42,7 +42,7 @@ ALONE_S = 60.0
 Victim = Literal["everything", "run", "worker"]
 
 BEGUN = re.compile(r"^\[\d+/\d+\] (\w+)$", re.MULTILINE)
-"""Line of a run's output at the beginning of a stage."""
+"""Line of a run's output at the beginning of a stage that has something to do."""
 
 COMPUTE_FILES = ("configs/tiny.yaml", "data/tiny/.finished/doctor.json", "data/tiny/settings.json")
 """Files of a clone that state how it was computed."""

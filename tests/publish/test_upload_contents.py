@@ -64,7 +64,7 @@ def exported_since(data: Path) -> None:
 
 
 def validated_since(data: Path) -> None:
-    (data / "validation.json").write_bytes((data / "validation.json").read_bytes())
+    (data / "validation.json").write_bytes((data / "validation.json").read_bytes() + b"\n")
 
 
 def without_card(data: Path) -> None:
@@ -152,7 +152,7 @@ def rotten(data: Path) -> None:
         (failed, r"1 of 1 checks failed: gripper \(episode-1 is turned\)"),
         (vacuous, "at least one check"),
         (exported_since, r"validation\.json: older than .*info\.json"),
-        (validated_since, r"README\.md: older than .*validation\.json"),
+        (validated_since, r"validation\.json: is a link, or has changed"),
         (without_card, r"README\.md: not there"),
         (foreign, r"1 files that are not of the dataset.*passwords\.txt"),
         (hidden, r"not of the dataset.*\.cache/note"),
@@ -176,6 +176,13 @@ def test_refuses(data: Path, spoil: Callable[[Path], None], complaint: str) -> N
     spoil(data)
     with pytest.raises(PipelineError, match=complaint):
         prepare(data, "lerobot")
+
+
+def test_a_run_that_repeats_its_checks_with_the_same_result_may_be_uploaded(data: Path) -> None:
+    """A finished run that is performed again writes no new card."""
+    files = prepare(data, "lerobot").files
+    (data / "validation.json").touch()
+    assert prepare(data, "lerobot").files == files
 
 
 def test_files_beside_the_card_of_another_format_stop_nothing(data: Path) -> None:
