@@ -84,11 +84,14 @@ def write_inputs(run: Run) -> None:
     write_json(run.path(SETTINGS), {**inputs.settings(run.config), "lost": _lost(run)})
 
 
-def _lost(run: Run) -> list[str]:
-    """List the missing records that are no outputs for DVC, as not every run has these datasets."""
-    datasets = (*run.formats, *run.failure_formats)
-    records = [dataset.record_file for dataset in datasets if dataset.record_file != dataset.stage_record]
-    return [file.relative_to(run.folder).as_posix() for file in records if not file.exists()]
+def _lost(run: Run) -> dict[str, list[str]]:
+    """List the missing records that are no outputs for DVC, by the stage's record: not every run has these datasets."""
+    lost: dict[str, list[str]] = {"rlds": [], "lerobot": []}
+    for dataset in (*run.formats, *run.failure_formats):
+        record = dataset.record_file
+        if record != dataset.stage_record and not record.exists():
+            lost[dataset.stage_record.stem].append(record.relative_to(run.folder).as_posix())
+    return lost
 
 
 def doctor(run: Run) -> None:

@@ -19,7 +19,7 @@ from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
-from pipeline.identity import RECIPES, fingerprint
+from pipeline.identity import RECIPES, fingerprint, versions
 from pipeline.run.export import untouched
 from pipeline.run.run import (
     COUNTS,
@@ -95,7 +95,8 @@ def of_stage(
         outputs: files and folders of the run.
     """
     try:
-        packages = [fingerprint(step) for step in RECIPES]
+        # The manifest states versions, also of this project.
+        packages = [versions(), *(fingerprint(step) for step in RECIPES)]
     except (PipelineError, PackageNotFoundError):
         # The stage `doctor` reports the fault.
         return Memory(run.folder, name, None, outputs)

@@ -167,6 +167,10 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     assert re.search(r"no longer needed, and deleted by a run with REMAKE=1, without which it stops: \d+ traj", told)
     for folder in ("trajectories", "frames"):
         shutil.rmtree(clone / "data/tiny" / folder)
+    told = call(clone, "status", "configs/tiny.yaml").stdout
+    assert re.search(r"no longer needed, .*: \d+ episodes of the datasets", told), "they would be replaced"
+    for record in ("rlds.json", "lerobot.json"):
+        (clone / "data/tiny" / record).unlink()
     assert would_run() == ["plan"]
 
 

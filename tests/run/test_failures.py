@@ -101,12 +101,15 @@ def test_a_damaged_set_of_failures_leaves_the_record_of_the_others(asked: Path, 
         (failed,) = (one for one in failures_of(config.data, config.export) if one.name == "rlds")
         seen_by_dvc = failed.stage_record.read_bytes()
         write_inputs(Run(config))
-        assert json.loads((config.data / "settings.json").read_text())["lost"] == []
+        assert json.loads((config.data / "settings.json").read_text())["lost"] == {"rlds": [], "lerobot": []}
         next(failed.folder.rglob("*.tfrecord*")).write_bytes(b"damaged")
         write_inputs(Run(config))
         assert not failed.record_file.exists()
         # By this DVC starts the stage.
-        assert json.loads((config.data / "settings.json").read_text())["lost"] == ["failures/rlds.json"]
+        assert json.loads((config.data / "settings.json").read_text())["lost"] == {
+            "rlds": ["failures/rlds.json"],
+            "lerobot": [],
+        }
         assert failed.stage_record.read_bytes() == seen_by_dvc
         assert {name for name in PARTS["rlds"].names if (config.data / name).exists()} == {
             "rlds",
