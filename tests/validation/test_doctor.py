@@ -1,6 +1,5 @@
 import json
 import platform
-import runpy
 import shutil
 import sys
 from importlib import metadata
@@ -12,7 +11,7 @@ import pytest
 from conftest import BOWL, MILK, REPOSITORY, STOVE, link_testset, run_in, tiny_config
 
 from pipeline import __main__ as command_line
-from pipeline import gl
+from pipeline import gl, stages
 from pipeline.catalogue import downloads
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import Config, DemosConfig, PlanConfig, load
@@ -59,7 +58,7 @@ def run_doctor(name: str, monkeypatch: pytest.MonkeyPatch, *, free_gb: float, **
 
 
 def run_stage(config: Config) -> None:
-    runpy.run_path(str(REPOSITORY / "stages" / "doctor.py"))["run"](Run(config))
+    stages.doctor(Run(config))
 
 
 def test_a_machine_that_was_set_up_is_fine(tmp_path: Path) -> None:
