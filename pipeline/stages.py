@@ -64,6 +64,8 @@ class Stage:
         settings: sections of ``settings.json`` that its outputs depend on.
         inputs: files and folders of the run that it reads.
         outputs: files and folders of the run that it writes.
+        whole: function that returns False if a stored file behind the outputs, such as a shard behind the record of its
+            dataset, was changed or deleted.
         memory: function that returns the memory of the last call, instead of one of settings, inputs and outputs.
     """
 
@@ -71,6 +73,7 @@ class Stage:
     settings: Sequence[str] = ()
     inputs: Sequence[str] = ()
     outputs: Sequence[str] = ()
+    whole: Callable[[Run], bool] | None = None
     memory: Callable[[Run], Memory] | None = None
 
 
@@ -127,7 +130,7 @@ def make_plan(run: Run) -> None:
             "different draws are left; use more demonstrations or ask for fewer",
             file=sys.stderr,
         )
-    plan_stage.write(rows, run)
+    plan.write(rows, run.plan_file)
     trajectories = len({row.trajectory_id for row in rows})
     print(f"planned {sum(row.wanted for row in rows)} episodes from {trajectories} trajectories")
 
@@ -299,6 +302,28 @@ def write_report(run: Run) -> None:
     print(f"{file} ({file.stat().st_size / 1e6:.1f} MB) opens in any browser")
 
 
+def _replays_whole(run: Run) -> bool:
+    return run.trajectories.untouched()
+
+
+def _frames_whole(run: Run) -> bool:
+    return run.trajectories.untouched() and run.frames.untouched()
+
+
+def _rlds_whole(run: Run) -> bool:
+    return _datasets_whole(run, "rlds.json")
+
+
+def _lerobot_whole(run: Run) -> bool:
+    return _datasets_whole(run, "lerobot.json")
+
+
+def _datasets_whole(run: Run, stage_record: str) -> bool:
+    """Return whether the finished datasets of one stage have all their files, unchanged."""
+    datasets = [dataset for dataset in run.recorded_formats if dataset.stage_record == run.path(stage_record)]
+    return all(export.untouched(dataset) for dataset in datasets)
+
+
 _OUTCOME = (PLAN, TRAJECTORIES_TABLE, FRAMES_TABLE)
 _RECORDS = ("rlds.json", "lerobot.json", "lerobot_v21.json")
 _REPORTS = (LEAKAGE, VALIDATION, STATISTICS)
@@ -309,19 +334,27 @@ STAGES = {
     "doctor": Stage(doctor, (*inputs.SECTIONS, "host"), (INPUTS,), (MACHINE,)),
     "plan": Stage(make_plan, memory=plan_stage.memory),
     "leakage": Stage(check_leakage, (), (PLAN,), (LEAKAGE,)),
-    "replay": Stage(replay, ("demos", "replay", "filter"), (INPUTS, MACHINE, PLAN, LEAKAGE), (REPLAY,)),
+    "replay": Stage(
+        replay,
+        ("demos", "replay", "filter"),
+        (INPUTS, MACHINE, PLAN, LEAKAGE),
+        (REPLAY, TRAJECTORIES_TABLE),
+        _replays_whole,
+    ),
     "render": Stage(
         render,
         ("demos", "replay", "filter", "render", "export"),
         (INPUTS, MACHINE, PLAN, REPLAY),
         (TRAJECTORIES_TABLE, FRAMES_TABLE),
+        _frames_whole,
     ),
-    "export_rlds": Stage(export_rlds, _EXPORT, _OUTCOME, ("rlds.json", "failures/rlds.json")),
+    "export_rlds": Stage(export_rlds, _EXPORT, _OUTCOME, ("rlds.json", "failures/rlds.json"), _rlds_whole),
     "export_lerobot": Stage(
         export_lerobot,
         (*_EXPORT, "plan"),
         (INPUTS, *_OUTCOME),
         ("lerobot.json", "lerobot_v21.json", "failures/lerobot.json", "failures/lerobot_v21.json"),
+        _lerobot_whole,
     ),
     "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
@@ -360,7 +393,8 @@ def perform(name: str, run: Run, title: str = "") -> None:
     """
     stage = STAGES[name]
     memory = _memory(name, run)
-    if memory is not None and memory.holds():
+    whole = stage.whole is None or stage.whole(run)
+    if whole and memory is not None and memory.holds():
         print(f"{title or name}: up to date", flush=True)
         return
     print(title or name, flush=True)

@@ -31,12 +31,6 @@ def make(config: Config) -> list[plan.Row]:
     return rows
 
 
-def write(rows: Sequence[plan.Row], run: Run) -> None:
-    """Write the plan, and remember the inputs that it was made from."""
-    plan.write(rows, run.plan_file)
-    memory(run).keep()
-
-
 def is_up_to_date(run: Run) -> bool:
     """Return whether the run has the plan that the stage would write: same settings, files, library and packages."""
     return memory(run).holds()

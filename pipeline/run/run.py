@@ -1,6 +1,6 @@
 """A run: one configuration, and everything that is stored in its folder ``data/<run>``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -17,6 +17,7 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.outcome import Outcome
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.types import Extra
 
 PLAN = "plan.parquet"
 MANIFEST = "manifest.parquet"
@@ -143,9 +144,11 @@ class Run:
         """Datasets that the configuration asks for; datasets of failures only if they exist."""
         return recorded(self.folder, self.config.export, self.config.render.extras)
 
-    def episodes(self, **options: Any) -> EpisodeLoader:
-        """Return the loader of rendered episodes; ``options`` are further fields of ``EpisodeLoader``."""
-        return EpisodeLoader(self.folder, self.config.render, **options)
+    def episodes(
+        self, extras: tuple[Extra, ...] = (), rewrites: Mapping[str, Sequence[str]] | None = None
+    ) -> EpisodeLoader:
+        """Return the loader of rendered episodes; for ``extras`` and ``rewrites`` see ``EpisodeLoader``."""
+        return EpisodeLoader(self.folder, self.config.render, extras, rewrites)
 
     def workers(self, *, renders: bool = False) -> AbstractContextManager[Workers]:
         """Start the workers of the section ``compute``, which stop when the context ends."""

@@ -1,6 +1,8 @@
 """``run`` performs the stages of any configuration file, several at a time, and does nothing twice."""
 
+import fcntl
 import hashlib
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import IN_SCRIPTS, link_testset, run_pipeline, tiny_config
+from conftest import IN_SCRIPTS, link_testset, run_pipeline, run_stages, tiny_config
 
 from pipeline import stages
 from pipeline.run import manifest
@@ -70,10 +72,27 @@ def test_three_runs_that_start_at_the_same_time_make_their_own_datasets(short_de
     assert {name for name in before | after if before.get(name) != after.get(name)} <= {"inputs.json", "settings.json"}
 
 
+@pytest.mark.slow
+def test_a_stage_that_is_called_alone_makes_again_what_was_deleted(
+    finished: Path, short_demos: Path, tmp_path: Path
+) -> None:
+    """As people do after an error names a stage's script; nothing listed the change before."""
+    data = Path(shutil.copytree(finished, tmp_path / "data" / "tiny"))
+    cases = {
+        "replay": next((data / "trajectories").glob("*.npz")),
+        "render": next((data / "frames").rglob("*.npz")),
+        "export_rlds": next((data / "rlds").rglob("*.tfrecord*")),
+        "export_lerobot": next((data / "lerobot").rglob("*.mp4")),
+    }
+    for stage, file in cases.items():
+        before = file.read_bytes()
+        file.unlink()
+        run_stages(tmp_path, tiny_config(short_demos), [stage])
+        assert file.read_bytes() == before, stage
+
+
 def test_a_second_run_of_one_folder_is_refused(tmp_path: Path, short_demos: Path) -> None:
     """While the first works, which a lock of the folder shows."""
-    import fcntl
-
     file = tmp_path / "first.yaml"
     file.write_text(yaml.safe_dump(noise_config("first", 1, short_demos)))
     folder = tmp_path / "data" / "first"
