@@ -5,7 +5,7 @@ from __future__ import annotations
 import faulthandler
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from math import inf
@@ -207,6 +207,7 @@ class _Workers:
     ) -> Generator[tuple[int, Result | Exception]]:
         """Yield the number of each item and its result or error, in the order in which items end."""
         from distributed import CancelledError, Future, KilledWorker
+        from distributed.comm import CommClosedError
 
         # Not pure: equal items are still separate work, and the scheduler must not remember earlier runs.
         futures = self.client.map(work, items, pure=False)
@@ -229,12 +230,14 @@ class _Workers:
                 except KilledWorker as error:
                     yield numbers.pop(future.key), error
                     continue
-                except (CancelledError, ConnectionError) as error:
+                except (CancelledError, CommClosedError, ConnectionError) as error:
                     raise self._lost("the Dask scheduler went away") from error
                 yield numbers.pop(future.key), result
         finally:
+            # A client whose scheduler has just died may still call itself running.
             if self.client.status == "running":
-                self.client.cancel([future for future in futures if future.key in numbers])
+                with suppress(OSError):
+                    self.client.cancel([future for future in futures if future.key in numbers])
 
     def _next(self, done: Queue[Any]) -> Any:
         """Return the next future that is done.
