@@ -11,40 +11,32 @@ both sides, and the number of frames with equal bytes.
 
 import argparse
 import json
-import os
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import mujoco
+import numpy as np
 from episode_slice import sliced
+from libero_environment import OffScreenRenderEnv
 
-os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-
-from pipeline import gl
-
-# Both sides render with the device that is chosen before robosuite is imported.
-gl.choose()
-
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
-
-from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer  # noqa: E402
-from pipeline.compute.pool import loop  # noqa: E402
-from pipeline.config import Config, load  # noqa: E402
-from pipeline.episode_schema import SCHEMA  # noqa: E402
-from pipeline.images.jpeg import encode, to_policy  # noqa: E402
-from pipeline.libero.tasks import find_task, select_tasks  # noqa: E402
-from pipeline.physics.environment import DUMMY_ACTION  # noqa: E402
-from pipeline.planning import plan, selection  # noqa: E402
-from pipeline.planning.streams import streams_of  # noqa: E402
-from pipeline.run.outcome import rejections  # noqa: E402
-from pipeline.run.render_stage import render_plan  # noqa: E402
-from pipeline.run.replay_stage import Replays  # noqa: E402
-from pipeline.stores.frame_store import FrameStore, shown_of  # noqa: E402
-from pipeline.stores.trajectory_store import TrajectoryStore  # noqa: E402
-from pipeline.testset import benchmark  # noqa: E402
-from pipeline.types import Trajectory  # noqa: E402
+from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer
+from pipeline.compute.pool import loop
+from pipeline.config import Config, load
+from pipeline.episode_schema import SCHEMA
+from pipeline.images.jpeg import encode, to_policy
+from pipeline.libero.tasks import find_task, select_tasks
+from pipeline.machine_code import SETTINGS, ensure_fixed_machine_code
+from pipeline.physics.environment import DUMMY_ACTION
+from pipeline.planning import plan, selection
+from pipeline.planning.streams import streams_of
+from pipeline.run.outcome import rejections
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
+from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.testset import benchmark
+from pipeline.types import Trajectory
 
 
 def main() -> None:
@@ -146,4 +138,5 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code(SETTINGS | {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
     main()

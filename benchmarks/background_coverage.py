@@ -12,9 +12,6 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, ClassVar
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 
 from pipeline.axes import RenderPerturbation
@@ -22,6 +19,7 @@ from pipeline.axes.background import PARTS, Part, skin_of
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.environment import Environment
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Floats, Frame
@@ -92,4 +90,5 @@ def frames(renderer: Renderer, state: Floats, parts: tuple[Part, ...], grey: int
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -13,13 +13,11 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 from pythons import contents
 
 from pipeline.images import jpeg
+from pipeline.machine_code import ensure_fixed_machine_code
 
 
 def frames(data: Path) -> Iterator[tuple[str, bytes]]:
@@ -73,4 +71,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 from pipeline.config import load
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.validation.needs import needed_mb
 
 STAGES = ("inputs", "plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest", "validate")
@@ -57,4 +58,5 @@ def size(folder: Path) -> int:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -27,6 +27,7 @@ from typing import Any
 from model_server import replaying
 
 from pipeline.libero.tasks import find_task
+from pipeline.machine_code import ensure_fixed_machine_code
 
 TASKS = (
     "libero_goal/turn_on_the_stove",
@@ -134,4 +135,5 @@ def children_s() -> float:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

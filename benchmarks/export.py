@@ -14,9 +14,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import cv2
 import numpy as np
 
@@ -27,6 +24,7 @@ from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.run.export import export
 from pipeline.types import Episode, Geometry
 
@@ -133,4 +131,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -14,7 +14,6 @@ picture encoded, as in the render stage. The last line is JSON with these figure
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -22,11 +21,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-os.environ |= {"LP_NUM_THREADS": "1"}
-
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import mujoco
 import numpy as np
 from replayed_twin import replayed_twin
@@ -34,6 +28,7 @@ from replayed_twin import replayed_twin
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode, to_policy
+from pipeline.machine_code import SETTINGS, ensure_fixed_machine_code
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame, Trajectory
@@ -112,4 +107,5 @@ def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool, dr
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code(SETTINGS | {"LP_NUM_THREADS": "1"})
     main()

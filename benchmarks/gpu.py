@@ -27,15 +27,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 from replayed_twin import replayed_twin
 
 from pipeline import gl
 from pipeline.config import RenderConfig, load
 from pipeline.images.jpeg import encode, to_policy
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.savings import PLAIN, why_plain
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -161,4 +159,5 @@ def _save(folder: str, name: str) -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

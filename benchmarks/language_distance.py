@@ -16,13 +16,11 @@ from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.libero.tasks import tasks
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.testset import benchmark
 from pipeline.types import Floats, Task
 
@@ -83,4 +81,5 @@ def summary(values: Floats) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

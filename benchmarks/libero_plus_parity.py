@@ -20,9 +20,6 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +31,7 @@ from pipeline.evaluation.libero_plus import RUNNABLE
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, balanced
 from pipeline.images.jpeg import to_policy
-from pipeline.machine_code import machine_code
+from pipeline.machine_code import ensure_fixed_machine_code, machine_code
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Floats, Frame
@@ -207,4 +204,5 @@ def totals(rows: list[dict[str, Any]], of_kind: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -17,9 +17,7 @@ from pathlib import Path
 
 os.environ["PLAIN_RENDERING"] = "1"
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
-# isort: split
 import cv2
 import numpy as np
 
@@ -29,6 +27,7 @@ from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.renderer import Renderer
@@ -89,4 +88,5 @@ def as_stored(renderer: Renderer, stream: Stream, step: int, jpeg_quality: int) 
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

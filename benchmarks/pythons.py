@@ -18,11 +18,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from zipfile import ZipFile
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import yaml
 
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.testset import benchmark
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -134,4 +132,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -21,9 +21,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 import psutil
 import yaml
@@ -35,6 +32,7 @@ from pipeline.files import replaced
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import select_tasks
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.environment import shared
 from pipeline.types import Task
 from pipeline.validation.needs import PUBLISHED
@@ -153,4 +151,5 @@ def _memory(pid: int) -> Iterator[int]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -11,12 +11,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import pipeline  # before NumPy, whose machine code it fixes
-
-# isort: split
 import cv2
 import numpy as np
 
+import pipeline
 import pipeline.run.render_job
 import pipeline.run.replay_job
 import pipeline.validation.doctor

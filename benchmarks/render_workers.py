@@ -22,13 +22,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
-os.environ |= {"LP_NUM_THREADS": "1"}
-
 from episode_slice import sliced
 
 from pipeline.compute.pool import Workers, loop, runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
+from pipeline.machine_code import SETTINGS, ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.render_stage import render_plan
@@ -100,4 +99,5 @@ def _warm(number: int) -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code(SETTINGS | {"LP_NUM_THREADS": "1"})
     main()

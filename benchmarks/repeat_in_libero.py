@@ -20,14 +20,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Floats, Scene, Task
@@ -150,4 +148,5 @@ def put_in(env: Any, scene: Scene) -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

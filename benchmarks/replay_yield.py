@@ -16,9 +16,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -29,6 +26,7 @@ from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.evaluation.statistics import wilson
 from pipeline.libero.tasks import SUITES, find_task
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.quality import smoothness
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan
@@ -191,4 +189,5 @@ def _print(lines: Sequence[Mapping[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

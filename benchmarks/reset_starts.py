@@ -15,9 +15,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import mujoco
 import numpy as np
 
@@ -26,6 +23,7 @@ from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig
 from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.starts import HOME_RAD
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.quality import smoothness
 from pipeline.planning import plan
 from pipeline.run.expand import REPLAY, ROUGH
@@ -120,4 +118,5 @@ def _spread(of_tasks: list[_Starts]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -13,14 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 from rich.console import Console
 from rich.table import Table
 
 from pipeline.axes import from_json
 from pipeline.evaluation.statistics import wilson
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.run import manifest
 from pipeline.run.counts import tried
 
@@ -68,4 +66,5 @@ def _yields(rows: Sequence[Row], groups: Callable[[Row], list[str]]) -> dict[str
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -11,14 +11,12 @@ import json
 import time
 from statistics import median
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.environment import Environment
 from pipeline.types import Demo, Floats
 
@@ -107,4 +105,5 @@ def compare(demo: Demo) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -23,25 +23,21 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from pipeline import gl  # before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 
-gl.prepare()
-
-from pipeline.config import ReplayConfig  # noqa: E402
-from pipeline.evaluation.libero_plus import camera  # noqa: E402
-from pipeline.libero import bddl  # noqa: E402
-from pipeline.libero.demonstrations import StarterSource  # noqa: E402
-from pipeline.libero.tasks import tasks  # noqa: E402
-from pipeline.physics.environment import shared  # noqa: E402
-from pipeline.physics.replay import replay  # noqa: E402
-from pipeline.rendering.renderer import Renderer  # noqa: E402
-from pipeline.rendering.sight import LEAST_PX, Sight  # noqa: E402
-from pipeline.scenes.compiled import proprioception  # noqa: E402
-from pipeline.testset import benchmark  # noqa: E402
-from pipeline.types import Floats, Task, Trajectory  # noqa: E402
+from pipeline.config import ReplayConfig
+from pipeline.evaluation.libero_plus import camera
+from pipeline.libero import bddl
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import tasks
+from pipeline.machine_code import ensure_fixed_machine_code
+from pipeline.physics.environment import shared
+from pipeline.physics.replay import replay
+from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.sight import LEAST_PX, Sight
+from pipeline.scenes.compiled import proprioception
+from pipeline.testset import benchmark
+from pipeline.types import Floats, Task, Trajectory
 
 
 def main() -> None:
@@ -113,4 +109,5 @@ def hides(things_px: dict[str, int], nominal_px: dict[str, int]) -> bool:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

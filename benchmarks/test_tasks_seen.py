@@ -13,25 +13,21 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 
-from pipeline import gl  # before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 
-gl.prepare()
-
-from pipeline.axes import level_of_test  # noqa: E402
-from pipeline.episode_schema import SCHEMA  # noqa: E402
-from pipeline.evaluation import libero_plus  # noqa: E402
-from pipeline.evaluation.simulator import Simulator  # noqa: E402
-from pipeline.evaluation.tasks import libero_states  # noqa: E402
-from pipeline.libero import bddl  # noqa: E402
-from pipeline.libero.tasks import tasks  # noqa: E402
-from pipeline.rendering.renderer import Renderer  # noqa: E402
-from pipeline.report.seen import Look, spread  # noqa: E402
-from pipeline.testset import benchmark  # noqa: E402
-from pipeline.testset.benchmark import TestTask  # noqa: E402
-from pipeline.types import Task  # noqa: E402
+from pipeline.axes import level_of_test
+from pipeline.episode_schema import SCHEMA
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.simulator import Simulator
+from pipeline.evaluation.tasks import libero_states
+from pipeline.libero import bddl
+from pipeline.libero.tasks import tasks
+from pipeline.machine_code import ensure_fixed_machine_code
+from pipeline.rendering.renderer import Renderer
+from pipeline.report.seen import Look, spread
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestTask
+from pipeline.types import Task
 
 SEVERITIES = (1, 5, 10)
 WALLS = ("walls_mat", "kitchen_background")
@@ -95,4 +91,5 @@ def _frames(simulator: Simulator, arena: str) -> Iterator[tuple[str, float]]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -13,9 +13,6 @@ from collections import Counter, defaultdict
 from functools import lru_cache
 from itertools import chain, repeat
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 
 from pipeline.config import ReplayConfig
@@ -25,6 +22,7 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task, select_tasks
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
@@ -96,4 +94,5 @@ def reference(suite: str, name: str) -> Reference | None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -15,9 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import av
 import cv2
 import numpy as np
@@ -35,6 +32,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.formats.lerobot_video import Video
 from pipeline.images.jpeg import decode, encode, to_policy
 from pipeline.libero.demonstrations import DemoEntry
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.replay_job import ReplayJob
@@ -129,4 +127,5 @@ def _summary(rows: NDArray[np.float64]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

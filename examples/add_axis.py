@@ -8,15 +8,13 @@ import sys
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import mujoco
 import numpy as np
 
 from pipeline import seeding
 from pipeline.axes.base import Axis, RenderPerturbation
 from pipeline.libero.tasks import find_task
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -63,4 +61,5 @@ def main(run: Path) -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main(Path(sys.argv[1]))

@@ -12,9 +12,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 import tensorflow_datasets as tfds
 

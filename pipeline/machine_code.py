@@ -1,14 +1,18 @@
-"""Machine code of NumPy and OpenBLAS: fixed before they are loaded, and reported where it is not.
+"""Machine code of NumPy and OpenBLAS: the one for AVX2, on every x86 processor that has it.
 
 OpenBLAS and NumPy choose machine code by the processor. The last bits of a torque follow from that choice, and a
-contact amplifies them to decimetres. Every x86 processor with AVX2 uses the code for AVX2 here. One demonstration
-therefore has one trajectory everywhere.
+contact amplifies them to decimetres. Under the environment variables of ``SETTINGS``, one demonstration has one
+trajectory everywhere.
+
+Both libraries read the variables once, when they are loaded. Therefore a program of this project starts itself again
+with them (``ensure_fixed_machine_code``), and its worker processes inherit them. An import changes nothing. A function
+whose result must be reproducible bit for bit calls ``fixed_machine_code``, which raises an error under other machine
+code.
 """
 
 import ctypes
 import os
 import sys
-import warnings
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
@@ -20,21 +24,24 @@ SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
     "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
 }
-"""Environment variables, which OpenBLAS and NumPy read once, when they are loaded."""
+"""Environment variables of OpenBLAS and NumPy."""
 
 FIXED = "Haswell AVX2"
 """Result of ``machine_code`` under these settings, on x86 processors with AVX2."""
 
-_NUMPY_CAME_FIRST = "numpy" in sys.modules
 
+def ensure_fixed_machine_code(variables: Mapping[str, str] = SETTINGS) -> None:
+    """Start this program again with the same arguments, unless the environment already has the variables.
 
-def fix() -> None:
-    """Set the variables for this process and its children; warn if NumPy has already chosen other machine code."""
-    os.environ.update(SETTINGS)
-    # Readers of a manifest need no machine code: a warning suffices. fixed_machine_code protects stored files.
-    fault = _fault()
-    if fault:
-        warnings.warn(str(fault), RuntimeWarning, stacklevel=3)
+    The first statement of a program calls this. The call does not return where it starts the program again.
+
+    Args:
+        variables: environment variables that the program needs from its start.
+    """
+    if all(os.environ.get(name) == value for name, value in variables.items()):
+        return
+    os.environ.update(variables)
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def in_shell(settings: Mapping[str, str]) -> str:
@@ -51,35 +58,23 @@ def machine_code() -> str:
 
 
 def fixed_machine_code() -> str:
-    """Return ``machine_code``, for files that are stored or read.
-
-    Raises:
-        PipelineError: when NumPy was imported before this package and computes with other machine code than is fixed.
-    """
-    fault = _fault()
-    if fault:
-        raise fault
-    return machine_code()
-
-
-def _fault() -> PipelineError | None:
-    """Return the error that NumPy computes with other machine code than is fixed, or ``None``.
+    """Return ``machine_code``, for results that must be reproducible bit for bit.
 
     A processor without AVX2, and a NumPy with another library for linear algebra, always use different machine code.
     Neither is an error.
+
+    Raises:
+        PipelineError: when this process computes with other machine code than its processor would under ``SETTINGS``.
     """
-    if not _NUMPY_CAME_FIRST:
-        return None
     kernel, widest = machine_code().split()
     as_fixed = widest == "AVX2" and kernel in (SETTINGS["OPENBLAS_CORETYPE"], "unknown")
     if as_fixed or widest in ("AVX", "baseline"):
-        return None
-    return PipelineError(
-        f"NumPy was imported before pipeline and computes with {machine_code()}: results differ in their last bits, "
-        "which contacts magnify, so that no file of a run can be read or written",
-        expected=f"{FIXED}, which importing pipeline fixes before NumPy is loaded",
-        remedy="import pipeline first, before numpy and what imports it (mujoco, pandas, torch and others), or start "
-        f"Python with {in_shell(SETTINGS)} in the environment",
+        return machine_code()
+    raise PipelineError(
+        f"NumPy computes with {machine_code()}: results differ in their last bits, which contacts magnify, so that no "
+        "file of a run can be read or written",
+        expected=f"{FIXED}, as in `python -m pipeline`",
+        remedy=f"start your script with this prefix: env {in_shell(SETTINGS)} python ...",
     )
 
 

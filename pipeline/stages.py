@@ -4,8 +4,6 @@ Each stage is a function of a ``Run``. ``perform`` calls it, unless its inputs a
 call. The command ``run`` performs all stages in one process; each script in ``stages/`` performs one stage, for DVC.
 """
 
-import argparse
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,14 +14,13 @@ from rich.console import Console
 
 from pipeline import gl
 from pipeline.errors import MAKE_AGAIN, PipelineError
-from pipeline.exit_status import exit_status
 from pipeline.files import read_json, write, write_json
 from pipeline.formats import exact_statistics, registry
 from pipeline.formats.episodes import by_suite
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
-from pipeline.identity import REMAKE, refuse_unasked
+from pipeline.identity import refuse_unasked
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
 from pipeline.run.cleaning import say_stale
@@ -49,7 +46,7 @@ from pipeline.run.run import (
     VALIDATION,
     Run,
 )
-from pipeline.run.stage import claimed, locked, refuse_other_folder
+from pipeline.run.stage import claimed, locked
 from pipeline.stores.frame_store import shown_of
 from pipeline.testset import benchmark
 
@@ -415,24 +412,3 @@ def _memory(name: str, run: Run) -> Memory | None:
     settings = inputs.settings(run.config)
     chosen = {section: settings[section] for section in stage.settings}
     return finished.of_stage(run, name, chosen, stage.inputs, stage.outputs)
-
-
-def script(name: str) -> None:
-    """Perform one stage on the configuration that the command line names; DVC calls this."""
-    parser = argparse.ArgumentParser(description=f"Stage {name}: {STAGES[name].work.__doc__}")
-    parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
-    parser.add_argument("--remake", action="store_true", help=f"make finished work again, as does {REMAKE}=1 before it")
-    arguments = parser.parse_args()
-    if arguments.remake:
-        os.environ[REMAKE] = "1"
-
-    def work() -> int:
-        refuse_other_folder(arguments.config)
-        config = claimed(arguments.config)
-        with locked(config.data):
-            perform(name, Run(config))
-        return 0
-
-    status = exit_status(work)
-    if status:
-        sys.exit(status)

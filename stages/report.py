@@ -1,6 +1,6 @@
 """Stage report, as DVC calls it; ``pipeline/stages.py`` has its function."""
 
-from pipeline.stages import script
+from pipeline.stage_script import perform_stage
 
 if __name__ == "__main__":
-    script("report")
+    perform_stage("report")

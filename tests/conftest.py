@@ -25,7 +25,6 @@ import yaml
 from filelock import FileLock
 from hypothesis import settings
 
-from pipeline import M_MMAP_THRESHOLD
 from pipeline.config import Config, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
@@ -54,6 +53,9 @@ settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
 
 LIBC = ctypes.CDLL("libc.so.6")
+M_MMAP_THRESHOLD = -3
+"""Number of an option in glibc's malloc.h."""
+
 # glibc returns freed blocks of this size to the system; without a fixed size it soon keeps those of a whole scene.
 LIBC.mallopt(M_MMAP_THRESHOLD, 2**20)
 

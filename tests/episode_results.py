@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
-from pipeline.__main__ import parser
+from pipeline.commands.command_line import parser
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.tasks import STEP_LIMITS

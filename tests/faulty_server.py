@@ -3,9 +3,6 @@
 import os
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import anyio
 from vla_eval.model_servers.base import SessionContext
 from vla_eval.model_servers.serve import run_server

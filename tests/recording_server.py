@@ -5,9 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 from vla_eval.model_servers.base import SessionContext
 from vla_eval.model_servers.predict import PredictModelServer

@@ -1,95 +1,78 @@
-"""The machine code is the fixed one wherever this project computes, or it is said that it is another."""
+"""Machine code is the fixed one wherever results must be reproducible, and an import changes nothing."""
 
 import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, SCRIPTS
 
 from pipeline.machine_code import FIXED, SETTINGS
 
 OTHER = {"OPENBLAS_CORETYPE": "Sandybridge"}
-"""What a process without the fixed settings may choose, on any processor that the fixed ones are meant for."""
+"""A choice that a process without the fixed settings may make, on any processor that the fixed ones are meant for."""
 
-SCRIPTS = [
-    file
-    for folder in ("benchmarks", "examples", "stages", "tests")
-    for file in sorted((REPOSITORY / folder).rglob("*.py"))
-    if not file.name.startswith("test_")
-    and re.search(r"^(from|import) (pipeline|conftest|arms)\b", file.read_text(), re.MULTILINE)
-    and re.search(r"^if __name__ ==|^main\(", file.read_text(), re.MULTILINE)
-]
-"""What is run as a program and uses this project."""
-
-# Imports what each script does until it reaches NumPy: then it is known which machine code that will choose.
-UNTIL_NUMPY = """
-import os, runpy, sys
-import pydantic, yaml  # which take long, and import no NumPy
-
-class Numpy:
-    def find_spec(self, name, path=None, target=None):
-        if name == "numpy":
-            if "OPENBLAS_CORETYPE" not in os.environ or "NPY_DISABLE_CPU_FEATURES" not in os.environ:
-                print(script, flush=True)
-            os._exit(0)
-
-sys.meta_path.insert(0, Numpy())
-for script in sys.argv[1:]:
-    if os.fork() == 0:
-        folder = os.path.dirname(script)
-        # A campaign of the tests puts the folder above it there too, as it is run.
-        sys.path[:1] = [folder, os.path.dirname(folder)]
-        runpy.run_path(script, run_name="imported")
-        os._exit(0)
-    os.wait()
+REPORT_AT_EXIT = """
+import atexit, os, sys
+report = lambda: print("ended with", os.environ.get("OPENBLAS_CORETYPE"), sys.argv[1:], file=sys.stderr)
+atexit.register(report)
 """
+"""Module that Python imports when it starts. A process that starts itself again does not reach its exit."""
 
 
-def python(script: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a script in a process that does not inherit what importing this project has set here."""
-    clean = {name: value for name, value in os.environ.items() if name not in SETTINGS}
-    return subprocess.run(
-        [sys.executable, "-c", script, *map(str, arguments)],
-        env=clean | environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def run_with_other_code(*command: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a program in an environment without the fixed settings."""
+    without_settings = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    words = [sys.executable, *map(str, command)]
+    everything = without_settings | OTHER | environment
+    return subprocess.run(words, env=everything, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.slow
-def test_a_script_that_uses_this_project_imports_it_before_numpy() -> None:
-    assert len(SCRIPTS) > 30
-    done = python(UNTIL_NUMPY, *SCRIPTS)
-    assert (done.stdout.splitlines(), done.stderr) == ([], "")
-
-
-def test_an_example_computes_with_the_fixed_machine_code() -> None:
-    imports = "import runpy, sys; runpy.run_path(sys.argv[1])"
-    asked = "from pipeline.machine_code import machine_code; print(machine_code())"
-    done = python(f"{imports}\n{asked}", REPOSITORY / "examples" / "add_axis.py", **OTHER)
-    assert (done.stdout.strip(), done.stderr) == (FIXED, "")
-
-
-def test_numpy_before_this_project_is_told_of_and_how_to_mend_it() -> None:
-    done = python("import numpy, pipeline; print('imported')", **OTHER)
-    assert done.stdout == "imported\n"
-    assert "NumPy was imported before pipeline and computes with Sandybridge" in done.stderr
-    assert "import pipeline first" in done.stderr
-    # The other remedy of the message.
-    settings = dict(re.findall(r'(\w+)="([^"]*)"', done.stderr))
-    script = "import numpy; from pipeline.identity import made_with; print(made_with('physics')['machine code'])"
-    assert settings.keys() == SETTINGS.keys()
-    done = python(script, **settings)
-    assert (done.stdout.strip(), done.stderr) == (FIXED, "")
-
-
-def test_nothing_is_stored_or_taken_for_old_with_other_machine_code(tmp_path: Path) -> None:
+def test_imports_change_no_environment_variable_and_work_in_any_order() -> None:
     script = """
+import os
 import numpy
+import pkgutil, pipeline
+watched = ("MUJOCO", "PYOPENGL", "LP_NUM", "OMP_", "OPENBLAS", "NPY_", "MALLOC", "NUMBA")  # third parties set others
+set_now = lambda: {name: value for name, value in os.environ.items() if name.startswith(watched)}
+before = set_now()
+not_imported = ("pipeline.__main__", "pipeline.evaluation.lerobot_eval")  # a program; needs another lerobot
+for module in pkgutil.walk_packages(pipeline.__path__, "pipeline."):
+    if "templates" not in module.name and module.name not in not_imported:
+        __import__(module.name)
+        assert set_now() == before, module.name
+import sys
+print(len([name for name in sys.modules if name.startswith("pipeline.")]))
+"""
+    done = run_with_other_code("-W", "error::RuntimeWarning", "-c", script)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert int(done.stdout) > 180
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        ["-m", "pipeline", "tasks", "--help"],
+        [SCRIPTS / "perturbed-demos", "tasks", "--help"],
+        [REPOSITORY / "stages" / "plan.py", "--help"],
+        [REPOSITORY / "benchmarks" / "disk.py", "--help"],
+    ],
+    ids=["module", "installed command", "stage", "benchmark"],
+)
+def test_a_program_starts_itself_once_with_the_settings(program: list[object], tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(REPORT_AT_EXIT)
+    done = run_with_other_code(*program, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "usage:" in done.stdout
+    arguments = [str(word) for word in program if str(word) in ("tasks", "--help")]
+    assert done.stderr == f"ended with {SETTINGS['OPENBLAS_CORETYPE']} {arguments}\n"
+
+
+def test_no_file_is_stored_or_identified_with_other_machine_code() -> None:
+    script = """
 from pathlib import Path
 from pipeline.errors import PipelineError
 from pipeline.identity import made_with
@@ -100,10 +83,33 @@ for use in (lambda: TrajectoryStore(Path("none")), lambda: made_with("physics"))
     except PipelineError as error:
         print(error)
 """
-    done = python(script, **OTHER)
-    assert done.stdout.count("NumPy was imported before pipeline") == 2, done.stderr
+    done = run_with_other_code("-c", script)
+    assert done.stdout.count("NumPy computes with Sandybridge") == 2, done.stderr
+
+    # Follow the remedy of the message.
+    settings = dict(re.findall(r'(\w+)="([^"]*)"', done.stdout))
+    assert settings == SETTINGS
+    script = "import numpy; from pipeline.identity import made_with; print(made_with('physics')['machine code'])"
+    done = run_with_other_code("-c", script, **settings)
+    assert (done.stdout.strip(), done.stderr) == (FIXED, "")
 
 
-def test_the_documentation_has_the_settings_for_a_worker() -> None:
+def test_no_demonstration_is_replayed_with_other_machine_code() -> None:
+    script = """
+from pipeline.config import ReplayConfig
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
+from pipeline.physics.environment import shared
+from pipeline.physics.replay import replay
+task = find_task("libero_goal", "turn_on_the_stove")
+replay(shared(task), StarterSource().of(task), "clean", ReplayConfig())
+"""
+    done = run_with_other_code("-c", script)
+    assert "NumPy computes with Sandybridge" in done.stderr
+
+
+def test_tests_and_documentation_have_the_settings() -> None:
+    assert tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest_env"] == SETTINGS
     text = (REPOSITORY / "docs" / "cost.md").read_text()
-    assert [setting for setting in SETTINGS.items() if 'export {}="{}"\n'.format(*setting) not in text] == []
+    for name, value in SETTINGS.items():
+        assert f'export {name}="{value}"\n' in text

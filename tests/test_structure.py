@@ -9,6 +9,7 @@ from conftest import REPOSITORY
 
 FLOORS = (
     "__main__",
+    "stage_script",
     "commands",
     "stages",
     "publish",

@@ -20,10 +20,6 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
-if sys.argv[1] == "evaluate":
-    import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 import pyarrow.parquet as pq
 import read_v21
@@ -103,6 +99,9 @@ def evaluate(root: Path, file: Path) -> None:
 def main() -> None:
     client, root, *further = sys.argv[1:]
     if client == "evaluate":
+        from pipeline.machine_code import ensure_fixed_machine_code
+
+        ensure_fixed_machine_code()
         evaluate(Path(root), Path(further[0]))
         return
     *assets, file = further

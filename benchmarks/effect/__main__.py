@@ -22,9 +22,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import episodes
 import sentences
 from experiment import Experiment, read
@@ -33,6 +30,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.task_list import write_tasks
 from pipeline.files import checksum
+from pipeline.machine_code import ensure_fixed_machine_code
 
 HERE = Path(__file__).resolve().parent
 sys.path.append(str(HERE.parent))
@@ -207,4 +205,5 @@ def do(arguments: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -12,9 +12,6 @@ import argparse
 import json
 from pathlib import Path
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 import pyarrow.parquet as pq
 
@@ -25,6 +22,7 @@ from pipeline.evaluation.policies import VIEWS, Wanted
 from pipeline.evaluation.selection import Selection, select
 from pipeline.formats.registry import formats_of
 from pipeline.images.jpeg import decode
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.types import Floats, Frame
 
 KEYS = {name: SCHEMA.views[view].lerobot_key for name, view in VIEWS.items()}
@@ -79,4 +77,5 @@ def compare(environment: EpisodeEnvironment, episode: dict[str, list[object]]) -
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

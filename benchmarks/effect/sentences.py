@@ -14,9 +14,6 @@ import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +21,7 @@ from pipeline.axes.language import deal
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.tasks import find_task
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.testset import benchmark
 
 FILE = Path(__file__).with_name("sentences.npz")
@@ -121,4 +119,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

@@ -5,9 +5,6 @@ python benchmarks/effect/server.py --args.folder data/effect/policies/clean_seed
 
 from typing import Any
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
-
-# isort: split
 import sentences
 import torch
 from lerobot.policies.act.modeling_act import ACTPolicy

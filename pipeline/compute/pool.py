@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import faulthandler
-import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -111,9 +110,6 @@ def runner(config: ComputeConfig, folder: Path, renders: bool = False) -> Iterat
 
 @contextmanager
 def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Workers]:
-    # Each worker process has one thread, as GL contexts and the simulator are not shared. Without these variables,
-    # OpenCV and NumPy would each start a thread for every core in every worker. Spawned workers inherit them.
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     import dask
     from distributed import Client
 

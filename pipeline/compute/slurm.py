@@ -9,6 +9,7 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
+from pipeline.compute.workers import VARIABLES
 from pipeline.compute_config import JOB_GB, ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
@@ -16,8 +17,6 @@ from pipeline.machine_code import SETTINGS, in_shell
 
 LOGS = Path(".work") / "slurm"
 """Folder, below the run's, of the jobs' output."""
-
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
 
 STARTS = 2
 """Number of jobs that may end before their worker starts, as a multiple of the workers."""
@@ -127,7 +126,7 @@ def slurm_jobs(config: ComputeConfig, folder: Path) -> Iterator[SlurmJobs]:
     logs = (folder / LOGS).absolute()
     logs.mkdir(parents=True, exist_ok=True)
     # A site may keep the environment of the submitting process from its jobs.
-    environment = f"export {in_shell(SETTINGS | dict.fromkeys(ONE_THREAD, '1'))}"
+    environment = f"export {in_shell(SETTINGS | VARIABLES | {'LP_NUM_THREADS': '1'})}"
     cluster = SLURMCluster(
         cores=1,
         processes=1,

@@ -12,6 +12,19 @@ from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
 
+VARIABLES = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+}
+"""Environment variables of a worker process, which it inherits; Dask's own values give way to them.
+
+A worker has one thread, as GL contexts and the simulator are not shared, but OpenCV and NumPy would start a thread for
+every core. Dask makes glibc return every 64 KB that are free to the system. In software rendering, each frame may then
+request thousands of pages again, up to a tenth of a worker's time.
+"""
+
 STARTS = 2
 """Number of attempts to start the workers, if they end before all have started."""
 
@@ -31,6 +44,7 @@ def local_cluster(workers: int | None, renders: bool) -> Iterator[tuple[Any, Cal
     from distributed import Client
 
     workers = workers or CPU_COUNT
+    os.environ.update(VARIABLES)
     # Software GL would also start a thread for every core; with fewer workers than cores, it uses the remaining cores.
     os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
     with _ended(_started(workers)) as cluster, Client(cluster) as client:

@@ -15,6 +15,7 @@ from pipeline.config import ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import kept_actions, recorded_start
+from pipeline.machine_code import fixed_machine_code
 from pipeline.physics.environment import Environment, UnusableSceneError, shared
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Route, follow
@@ -42,7 +43,11 @@ def replay(
         perturbations: changes to apply before the first step.
         reference: returns the reference that tracking follows. If it returns ``None``, the replay is open-loop, also
             in mode ``tracked``; the result states its mode.
+
+    Raises:
+        PipelineError: when NumPy does not compute with the fixed machine code.
     """
+    fixed_machine_code()
     try:
         scene, refused = _perturbed(environment, demo, config, perturbations)
     except UnusableSceneError as error:

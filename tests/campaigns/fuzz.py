@@ -27,9 +27,7 @@ from typing import Any
 if __name__ == "__main__":  # run as a script: with what the tests share
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
-import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
-# isort: split
 import numpy as np
 from conftest import REPOSITORY, STOVE, starter_demo
 from episode_results import result
@@ -49,6 +47,7 @@ from pipeline.libero import bddl, hdf5
 from pipeline.libero.assets import relocate
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.starts import recorded_start
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.run import manifest
 from pipeline.stores.frame_store import FrameStore
@@ -449,4 +448,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

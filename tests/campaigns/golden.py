@@ -17,16 +17,15 @@ from typing import Any
 if __name__ == "__main__":  # run as a script, from anywhere
     sys.path[:0] = [os.fspath(folder) for folder in Path(__file__).parents[1:3]]
 
-from pipeline import gl, identity  # before NumPy, whose machine code this fixes
-
-# isort: split
 import numpy as np
 
+from pipeline import gl, identity
 from pipeline.axes import PhysicsPerturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer
 from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.images.jpeg import encode
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
@@ -153,4 +152,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

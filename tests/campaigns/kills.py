@@ -30,9 +30,10 @@ from typing import Any, Literal
 if __name__ == "__main__":  # run as a script: with what the tests share
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
-# isort: split
 import psutil
 from conftest import IN_SCRIPTS, in_a_clone
+
+from pipeline.machine_code import ensure_fixed_machine_code
 
 SURVIVES_S = 20.0
 """Time that a run continues after the death of a worker, before it is killed as well."""
@@ -277,4 +278,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

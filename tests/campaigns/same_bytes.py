@@ -16,9 +16,10 @@ from pathlib import Path
 if __name__ == "__main__":  # run as a script: with what the tests share
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
-# isort: split
 from conftest import STOVE, in_a_clone, loaded_whole, replay_whole, run_pipeline, tiny_config, write_short_demos
 from kills import COMPUTE_FILES, compared
+
+from pipeline.machine_code import ensure_fixed_machine_code
 
 COMPUTE: dict[str, dict[str, object]] = {
     "two": {"cluster": "local", "workers": 2},
@@ -65,4 +66,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

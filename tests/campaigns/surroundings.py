@@ -24,9 +24,10 @@ from typing import Any
 if __name__ == "__main__":  # run as a script: with what the tests share
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
-# isort: split
 from conftest import IN_SCRIPTS, STAGES, in_a_clone
 from kills import STARTER, compared
+
+from pipeline.machine_code import ensure_fixed_machine_code
 
 FIRST_KB, MORE_KB = 64, 1500
 """Initial size of the file system, and its growth each time that it is full."""
@@ -117,4 +118,5 @@ def remade_by_another_clock(clone: Path) -> list[str]:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

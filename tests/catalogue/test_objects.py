@@ -15,7 +15,6 @@ import pytest
 import yaml
 from PIL import Image
 
-from pipeline.__main__ import parser
 from pipeline.axes.layout import LayoutAxis
 from pipeline.catalogue import object_sources, sweethome3d
 from pipeline.catalogue.meshes import convert
@@ -23,6 +22,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Package, catalogue
 from pipeline.catalogue.objects import TEST_CATEGORIES, find, goes_with, models, taken
 from pipeline.catalogue.sources import Folder
+from pipeline.commands.command_line import parser
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.seeding import rng

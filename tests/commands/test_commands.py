@@ -18,7 +18,8 @@ import yaml
 from conftest import IN_SCRIPTS, REPOSITORY, dvc, rot, tiny_config
 
 from pipeline import stages
-from pipeline.__main__ import main, parser
+from pipeline.__main__ import main
+from pipeline.commands.command_line import parser
 from pipeline.files import edition
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.run import manifest
@@ -35,7 +36,7 @@ COMMANDS = [
 ]
 HELP = """
 import sys
-from pipeline.__main__ import parser
+from pipeline.commands.command_line import parser
 told = parser().format_help()
 print(sorted({"numpy", "pydantic", "yaml", "rich", "h5py"}.intersection(sys.modules)))
 """

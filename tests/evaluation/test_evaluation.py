@@ -14,34 +14,27 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY, STOVE
 from episode_results import result
+from libero_environment import OffScreenRenderEnv, transform
+from model_server import replaying
+from vla_eval.rotation import quat_to_axisangle
 
-from pipeline import gl
-
-# LIBERO's environment renders with what robosuite finds in MUJOCO_GL when it is imported.
-gl.choose()
-
-import robosuite.utils.transform_utils as transform  # noqa: E402
-from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
-from model_server import replaying  # noqa: E402
-from vla_eval.rotation import quat_to_axisangle  # noqa: E402
-
-from pipeline.__main__ import main  # noqa: E402
-from pipeline.axes.camera import CameraPerturbation  # noqa: E402
-from pipeline.axes.corruptions import Gaussian  # noqa: E402
-from pipeline.axes.noise import NoisePerturbation  # noqa: E402
-from pipeline.errors import PipelineError  # noqa: E402
-from pipeline.evaluation import libero_plus  # noqa: E402
-from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings  # noqa: E402
-from pipeline.evaluation.evaluate import _environment  # noqa: E402
-from pipeline.evaluation.policies import Wanted  # noqa: E402
-from pipeline.evaluation.selection import Selection, select  # noqa: E402
-from pipeline.evaluation.simulator import Simulator  # noqa: E402
-from pipeline.evaluation.statistics import summary  # noqa: E402
-from pipeline.evaluation.tasks import EvaluationTask, libero_states  # noqa: E402
-from pipeline.images.jpeg import to_policy  # noqa: E402
-from pipeline.physics.control_env import control_env  # noqa: E402
-from pipeline.seeding import rng  # noqa: E402
-from pipeline.testset.benchmark import load  # noqa: E402
+from pipeline.__main__ import main
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.corruptions import Gaussian
+from pipeline.axes.noise import NoisePerturbation
+from pipeline.errors import PipelineError
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.evaluate import _environment
+from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.simulator import Simulator
+from pipeline.evaluation.statistics import summary
+from pipeline.evaluation.tasks import EvaluationTask, libero_states
+from pipeline.images.jpeg import to_policy
+from pipeline.physics.control_env import control_env
+from pipeline.seeding import rng
+from pipeline.testset.benchmark import load
 
 ACTIONS = rng("test_evaluation").uniform(-1, 1, (4, 7))
 FIRST = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))[0]

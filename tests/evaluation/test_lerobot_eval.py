@@ -10,25 +10,19 @@ import checkpoints
 import numpy as np
 import pytest
 from conftest import STOVE
+from libero_environment import OffScreenRenderEnv
 
-from pipeline import gl
-
-# LIBERO's environment renders with what robosuite finds in MUJOCO_GL when it is imported.
-gl.choose()
-
-from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
-
-from pipeline.errors import PipelineError  # noqa: E402
-from pipeline.evaluation import environment  # noqa: E402
-from pipeline.evaluation.environment import EpisodeSettings  # noqa: E402
-from pipeline.evaluation.gym_environment import PerturbedLiberoEnv  # noqa: E402
-from pipeline.evaluation.results import read, refuse_different, stored  # noqa: E402
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig  # noqa: E402
-from pipeline.evaluation.selection import Selection, select  # noqa: E402
-from pipeline.evaluation.tasks import libero_states  # noqa: E402
-from pipeline.libero.tasks import STEP_LIMITS, tasks  # noqa: E402
-from pipeline.seeding import rng  # noqa: E402
-from pipeline.types import Task  # noqa: E402
+from pipeline.errors import PipelineError
+from pipeline.evaluation import environment
+from pipeline.evaluation.environment import EpisodeSettings
+from pipeline.evaluation.gym_environment import PerturbedLiberoEnv
+from pipeline.evaluation.results import read, refuse_different, stored
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import libero_states
+from pipeline.libero.tasks import STEP_LIMITS, tasks
+from pipeline.seeding import rng
+from pipeline.types import Task
 
 ACTIONS = rng("test_lerobot_eval").uniform(-1, 1, (10, 7))
 

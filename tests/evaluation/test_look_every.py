@@ -8,25 +8,20 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import libero_environment  # noqa: F401 - robosuite with OpenGL, for the harness's classes
 import pytest
 from conftest import REPOSITORY, STOVE
+from model_server import running
+from vla_eval.connection import Connection
+from vla_eval.runners.sync_runner import SyncEpisodeRunner
 
-from pipeline import gl
-
-# The harness's classes import robosuite, which renders with what MUJOCO_GL says then.
-gl.choose()
-
-from model_server import running  # noqa: E402
-from vla_eval.connection import Connection  # noqa: E402
-from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
-
-from pipeline.errors import PipelineError  # noqa: E402
-from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
-from pipeline.evaluation.harness import PerturbedLibero  # noqa: E402
-from pipeline.evaluation.policies import Server  # noqa: E402
-from pipeline.evaluation.rollout import roll_out_policy  # noqa: E402
-from pipeline.evaluation.selection import Selection, select  # noqa: E402
-from pipeline.libero.tasks import STEP_LIMITS  # noqa: E402
+from pipeline.errors import PipelineError
+from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.harness import PerturbedLibero
+from pipeline.evaluation.policies import Server
+from pipeline.evaluation.rollout import roll_out_policy
+from pipeline.evaluation.selection import Selection, select
+from pipeline.libero.tasks import STEP_LIMITS
 
 STEPS, LOOK_EVERY = 17, 8
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))

@@ -10,33 +10,27 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import MILK, REPOSITORY, STOVE
+from libero_environment import OffScreenRenderEnv, transform
 
-from pipeline import axes, gl
-
-# LIBERO's environment renders with what robosuite finds in MUJOCO_GL when it is imported.
-gl.choose()
-
-import robosuite.utils.transform_utils as transform  # noqa: E402
-from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
-
-from pipeline.axes.camera import CameraPerturbation  # noqa: E402
-from pipeline.axes.light import LightPerturbation  # noqa: E402
-from pipeline.axes.noise import NoiseAxis  # noqa: E402
-from pipeline.config import RenderConfig  # noqa: E402
-from pipeline.episode_schema import SCHEMA  # noqa: E402
-from pipeline.images.jpeg import decode, encode, to_policy  # noqa: E402
-from pipeline.planning.streams import Stream, streams_of  # noqa: E402
-from pipeline.rendering.render import render  # noqa: E402
-from pipeline.rendering.renderer import LastScene, Renderer  # noqa: E402
-from pipeline.rendering.sight import LEAST_PX, MOST_OUTSIDE, Sight  # noqa: E402
-from pipeline.scenes.compiled import proprioception  # noqa: E402
-from pipeline.seeding import rng  # noqa: E402
-from pipeline.stores.frame_store import FrameStore  # noqa: E402
-from pipeline.types import Frame, Task, Trajectory  # noqa: E402
+from pipeline import axes
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.light import LightPerturbation
+from pipeline.axes.noise import NoiseAxis
+from pipeline.config import RenderConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.images.jpeg import decode, encode, to_policy
+from pipeline.planning.streams import Stream, streams_of
+from pipeline.rendering.render import render
+from pipeline.rendering.renderer import LastScene, Renderer
+from pipeline.rendering.sight import LEAST_PX, MOST_OUTSIDE, Sight
+from pipeline.scenes.compiled import proprioception
+from pipeline.seeding import rng
+from pipeline.stores.frame_store import FrameStore
+from pipeline.types import Frame, Task, Trajectory
 
 sys.path.append(str(REPOSITORY / "examples"))
 
-from add_axis import LensPerturbation  # noqa: E402
+from add_axis import LensPerturbation
 
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
 

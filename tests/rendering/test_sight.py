@@ -1,24 +1,19 @@
 """No camera of a test task is refused for the hand; one that shows less of it than all of them is."""
 
+import numpy as np
 import pytest
 from arenas import TASKS
 from conftest import REPOSITORY, starter_demo
 
-from pipeline import gl
-
-gl.prepare()
-
-import numpy as np  # noqa: E402
-
-from pipeline.axes.camera import CameraPerturbation  # noqa: E402
-from pipeline.config import ReplayConfig  # noqa: E402
-from pipeline.evaluation import libero_plus  # noqa: E402
-from pipeline.physics.environment import shared  # noqa: E402
-from pipeline.physics.replay import replay  # noqa: E402
-from pipeline.planning.streams import Stream  # noqa: E402
-from pipeline.rendering.renderer import LastScene  # noqa: E402
-from pipeline.rendering.sight import FirstFrame  # noqa: E402
-from pipeline.testset import benchmark  # noqa: E402
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.config import ReplayConfig
+from pipeline.evaluation import libero_plus
+from pipeline.physics.environment import shared
+from pipeline.physics.replay import replay
+from pipeline.planning.streams import Stream
+from pipeline.rendering.renderer import LastScene
+from pipeline.rendering.sight import FirstFrame
+from pipeline.testset import benchmark
 
 STUDY = TASKS["study"]
 

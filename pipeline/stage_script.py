@@ -1,0 +1,36 @@
+"""Scripts in ``stages/``, one for each stage, which DVC calls."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from pipeline.machine_code import ensure_fixed_machine_code
+
+
+def perform_stage(name: str) -> None:
+    """Perform one stage on the configuration that the command line names."""
+    ensure_fixed_machine_code()
+    from pipeline.exit_status import exit_status
+    from pipeline.identity import REMAKE
+    from pipeline.run.run import Run
+    from pipeline.run.stage import claimed, locked, refuse_other_folder
+    from pipeline.stages import STAGES, perform
+
+    parser = argparse.ArgumentParser(description=f"Stage {name}: {STAGES[name].work.__doc__}")
+    parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
+    parser.add_argument("--remake", action="store_true", help=f"make finished work again, as does {REMAKE}=1 before it")
+    arguments = parser.parse_args()
+    if arguments.remake:
+        os.environ[REMAKE] = "1"
+
+    def work() -> int:
+        refuse_other_folder(arguments.config)
+        config = claimed(arguments.config)
+        with locked(config.data):
+            perform(name, Run(config))
+        return 0
+
+    status = exit_status(work)
+    if status:
+        sys.exit(status)
