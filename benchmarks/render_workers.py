@@ -32,6 +32,8 @@ from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.types import Frame
 
@@ -47,11 +49,11 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         root = Path(temporary)
         trajectories = root / "trajectories"
-        Replays(config.demos, config.replay, trajectories, loop, config.filter).of(rows)
+        Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop, config.filter).of(rows)
 
         def rendered(run: Workers, name: str) -> float:
             start = time.perf_counter()
-            render_plan(rows, config, trajectories, root / name, run)
+            render_plan(rows, config, TrajectoryStore(trajectories), FrameStore(root / name, config.render), run)
             return time.perf_counter() - start
 
         drawn_s: list[tuple[float, float]] = []

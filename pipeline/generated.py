@@ -7,12 +7,12 @@ import os
 import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import checksum, read_json, remove, replaced, write_json
 from pipeline.identity import ALLOW, REMAKE
+from pipeline.record import Basis, Record
 
 RECORD = ".generated.json"
 """File of a generated folder that lists its other files."""
@@ -23,19 +23,6 @@ FOLDERS = ("finetune", "card")
 MAX_NAMED = 20
 
 
-@dataclass(frozen=True)
-class Generated:
-    """The record of a generated folder.
-
-    Attributes:
-        files: path below the folder to SHA-256.
-        made_from: name of each file of the run that the content was generated from, to SHA-256.
-    """
-
-    files: Mapping[str, str]
-    made_from: Mapping[str, str]
-
-
 @contextmanager
 def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Iterator[Path]:
     """Yield an empty folder to write into; on success record its files and give it the place of ``folder``.
@@ -43,7 +30,7 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
     A killed process leaves the old folder, the new one or none.
 
     Args:
-        made_from: see ``Generated``.
+        made_from: name of each file of the run that the content is generated from, to SHA-256.
 
     Raises:
         PipelineError: if edits would be lost and ``REMAKE=1`` does not allow it; ``folder`` is then unchanged.
@@ -60,8 +47,8 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
     remove(old)
 
 
-def record(folder: Path) -> Generated:
-    """Read the record of a generated folder.
+def read_record(folder: Path) -> Record:
+    """Read the record of a generated folder, whose request is ``made_from``.
 
     Raises:
         PipelineError: if the record is missing or damaged.
@@ -69,9 +56,10 @@ def record(folder: Path) -> Generated:
     file = folder / RECORD
     content = read_json(file)
     try:
-        return Generated(dict(content["files"]), dict(content["made_from"]))
+        files, made_from = dict(content["files"]), dict(content["made_from"])
     except (KeyError, TypeError, ValueError) as error:
         raise PipelineError(f"damaged ({error!r})", where=file, expected="files and made_from") from error
+    return Record(Basis.of(made_from, {}), files)
 
 
 def edits(folder: Path) -> dict[str, str]:
@@ -84,7 +72,7 @@ def edits(folder: Path) -> dict[str, str]:
     if folder.is_symlink() or folder.is_file():
         return {folder.name: "not a folder"}
     try:
-        recorded = dict(record(folder).files)
+        recorded = dict(read_record(folder).files)
         unknown = "added"
     except PipelineError:
         recorded, unknown = {}, "without a record"
@@ -113,7 +101,7 @@ def unchanged(folder: Path, below: str = "") -> dict[str, Path]:
     """
     if folder.is_symlink():
         raise PipelineError("is a symbolic link", where=folder, expected="the folder that a stage generated")
-    recorded = [path for path in record(folder).files if PurePosixPath(path).is_relative_to(below)]
+    recorded = [path for path in read_record(folder).files if PurePosixPath(path).is_relative_to(below)]
     faults = {path: how for path, how in edits(folder).items() if PurePosixPath(path).is_relative_to(below)}
     faults |= {path: "not there" for path in recorded if not os.path.lexists(folder / path)}
     if faults:

@@ -9,13 +9,13 @@
 6. A step that builds on other steps (``AFTER``) includes their recipes and packages.
 7. The fingerprint of a file is a digest of recipes, packages, machine code and the settings that its bytes depend on.
 8. A file is named after its inputs, and is up to date if it has today's fingerprint. Else it counts as missing.
-9. A stage with few outputs (an export, ``validate``, ``summary``) has one fingerprint, of all its inputs.
+9. A stage with few outputs (an export, ``validate``, ``summary``) has one record of all its inputs and outputs.
+   ``pipeline/record.py`` has the record, which also says why work is not up to date.
 10. Before finished files of today's plan are generated again, a person must allow it (``refuse_unasked``).
 """
 
 import os
 from collections import Counter
-from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -119,13 +119,6 @@ def fingerprint(step: Step, *settings: object) -> str:
         PipelineError: when NumPy's machine code is not the fixed one, or a clone is imported in place of a package.
     """
     return digest(_parts(step), *settings)[:16]
-
-
-def differences(then: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Describe the differences of two ``made_with`` in words; empty if they are equal."""
-    names = dict.fromkeys([*then, *now])
-    changed = [name for name in names if then.get(name) != now.get(name)]
-    return ", ".join(f"{name} {then.get(name, 'none')}, here {now.get(name, 'none')}" for name in changed)
 
 
 ALLOW = f"`{REMAKE}=1` before the command, or --remake behind one stage's"

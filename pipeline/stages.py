@@ -26,10 +26,7 @@ from pipeline.run import counts, dropped, export, finished, inputs, machine, man
 from pipeline.run.cleaning import say_stale
 from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
 from pipeline.run.foreign import refuse_foreign_files
-from pipeline.run.outcome import outdated, rejections
-from pipeline.run.render_stage import render_plan
-from pipeline.run.replay_stage import Replays
-from pipeline.run.run import (
+from pipeline.run.layout import (
     CARD,
     COUNTS,
     FINETUNE,
@@ -44,8 +41,11 @@ from pipeline.run.run import (
     SHEETS,
     STATISTICS,
     VALIDATION,
-    Run,
 )
+from pipeline.run.outcome import outdated, rejections
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
+from pipeline.run.run import Run
 from pipeline.run.stage import claimed, locked
 from pipeline.stores.frame_store import shown_of
 from pipeline.testset import benchmark
@@ -99,7 +99,7 @@ def doctor(run: Run) -> None:
     from pipeline.validation import doctor
 
     try:
-        tried = finished.of_doctor(run, gl.choose().device).holds()
+        tried = finished.trial_memory(run, gl.choose().device).holds()
     except (PipelineError, PackageNotFoundError):
         # The table of `doctor.run` reports missing packages.
         tried = False
@@ -112,7 +112,7 @@ def doctor(run: Run) -> None:
         )
     if not tried:
         machine.record(run, machine.trial().digests)
-        finished.of_doctor(run, gl.choose().device).keep()
+        finished.trial_memory(run, gl.choose().device).keep()
     if not tried or machine.known_speed(run) is None:
         machine.keep_speed(run, machine.trial().speed)
 
@@ -147,7 +147,7 @@ def replay(run: Run) -> None:
     refuse_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
     dropped.refuse_unasked(rows, run)
     with run.workers() as workers:
-        replays = Replays(config.demos, config.replay, run.trajectories.root, workers, config.filter)
+        replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
         verdicts = replays.of(rows)
     # Keep the reserves too that the stage `render` replayed because frames were rejected.
     run.trajectories.keep(row.trajectory_id for row in rows)
@@ -170,7 +170,7 @@ def render(run: Run) -> None:
     config.export.refuse_too_few(plan.demonstrations(rows))
     replayed = int(read_json(run.path(REPLAY))["replayed"])
     with run.workers(renders=True) as workers:
-        replays = Replays(config.demos, config.replay, run.trajectories.root, workers, config.filter)
+        replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
         rejected: dict[str, str] | None = None
         while True:
             rejected_now = rejections(rows, shown_of(run.frames.rows()))
@@ -178,7 +178,7 @@ def render(run: Run) -> None:
                 break
             rejected = rejected_now
             verdicts = replays.of(rows, rejected)
-            rendered = render_plan(rows, config, run.trajectories.root, run.frames.root, workers)
+            rendered = render_plan(rows, config, run.trajectories, run.frames, workers)
             run.frames.keep(rendered)
     run.trajectories.keep(verdicts)
     further = len(verdicts) - replayed
@@ -221,7 +221,7 @@ def write_manifest(run: Run) -> None:
 def validate(run: Run) -> None:
     """Reopen the datasets and the manifest, and stop if they differ from the generated episodes."""
     file = run.validation_file
-    if finished.of_validate(run).holds():
+    if finished.validate_memory(run).holds():
         # `push` requires checks that are no older than the checked files.
         file.touch()
         print(f"nothing has changed since the checks of {file} found nothing off")
@@ -241,7 +241,7 @@ def validate(run: Run) -> None:
             expected=first["expected"],
             remedy=f"read {file}, correct the cause, and run `{MAKE_AGAIN}` again",
         )
-    finished.of_validate(run).keep()
+    finished.validate_memory(run).keep()
     print(f"{len(report)} checks found nothing off, see {file}")
 
 
@@ -259,7 +259,7 @@ def write_recipe(run: Run) -> None:
 def summarize(run: Run) -> None:
     """Render contact sheets, of the run and of one task per suite, and print the run's counts."""
     rows, episodes = run.manifest, run.config.plan.episodes
-    memory = finished.of_summary(run)
+    memory = finished.summary_memory(run)
     if not memory.holds():
         _render_sheets(run)
         memory.keep()
@@ -272,7 +272,7 @@ def _render_sheets(run: Run) -> None:
     from pipeline.report import preview, sheets
 
     sheets.write(run.manifest, run.episodes(), run.path(SHEETS))
-    previews = finished.of_previews(run)
+    previews = finished.previews_memory(run)
     if not previews.holds():
         with run.workers(renders=True) as workers:
             preview.for_run(run.config, run.path(PREVIEWS), workers)
@@ -290,7 +290,7 @@ def write_card(run: Run) -> None:
 def write_report(run: Run) -> None:
     """Write one HTML page about the run, with its counts, plots, pictures and videos in it."""
     file = run.report_file
-    memory = finished.of_report(run)
+    memory = finished.report_memory(run)
     if not memory.holds():
         from pipeline.report import report
 
@@ -411,4 +411,4 @@ def _memory(name: str, run: Run) -> Memory | None:
         return None
     settings = inputs.settings(run.config)
     chosen = {section: settings[section] for section in stage.settings}
-    return finished.of_stage(run, name, chosen, stage.inputs, stage.outputs)
+    return finished.stage_memory(run, name, chosen, stage.inputs, stage.outputs)

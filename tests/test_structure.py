@@ -35,6 +35,7 @@ FLOORS = (
     "libero",
     "generated",
     "identity",
+    "record",
     "episode_schema",
     "export_config",
     "publish_config",

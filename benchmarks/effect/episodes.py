@@ -78,7 +78,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
         rejected: dict[str, str] | None = None
         while (rejected_now := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = rejected_now
-            Replays(run.demos, run.replay, trajectories.root, workers, run.filter).of(rows, rejected)
+            Replays(run.demos, run.replay, trajectories, workers, run.filter).of(rows, rejected)
             outcome = selection.select(chosen, verdicts_of(trajectories.rows(), chosen, run.filter), rejected)
             kept = [row for row in chosen if outcome[row.episode_id].kept]
             if len(kept) < experiment.episodes:
@@ -89,7 +89,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
                     expected="as many in all arms",
                     remedy="raise plan.reserve there for perturbed episodes, or spare in the experiment for clean ones",
                 )
-            render_plan(chosen, run, trajectories.root, frames.root, workers)
+            render_plan(chosen, run, trajectories, frames, workers)
         _write(kept, EpisodeLoader(folder, run.render), experiment.frame_px, workers, file)
 
 

@@ -47,7 +47,7 @@ def check(arguments: argparse.Namespace) -> int:
     validate, which is a part of every run, compares the content of the datasets with each other and with the plan.)
     """
     from pipeline.clients import oft
-    from pipeline.run.run import STATISTICS
+    from pipeline.run.layout import STATISTICS
     from pipeline.validation.verify import verify
 
     run = owned(arguments)

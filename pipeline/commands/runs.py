@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def results(run: Run) -> dict[str, Path]:
     """Map names to the files and folders of a finished run that a person opens."""
-    from pipeline.run.run import CARD, FINETUNE, PREVIEWS, SHEETS
+    from pipeline.run.layout import CARD, FINETUNE, PREVIEWS, SHEETS
 
     return {
         **{dataset.title: dataset.root for dataset in run.formats},

@@ -23,6 +23,7 @@ from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, con
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.results import PER_TASK, EpisodeFiles, EpisodeResult, refuse_shared_names
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.record import Basis, Record
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
 from pipeline.types import Frame
@@ -129,7 +130,7 @@ class Evaluation:
     def result(self, task: EvaluationTask) -> EpisodeResult | None:
         """Return the stored result of an episode if it is up to date, else `None`."""
         row = self.files.row(self.episode(task))
-        return row if row is not None and _deciding(row) == self.versions(task) else None
+        return row if row is not None and _record(row).matches(self.basis(task)) else None
 
     def check(self, tasks: Iterable[EvaluationTask]) -> None:
         """Reject a folder that this evaluation must not write into.
@@ -144,10 +145,14 @@ class Evaluation:
         outdated: Counter[str] = Counter()
         for task in tasks:
             row = self.files.row(self.episode(task))
-            reason = "" if row is None else _differences(_deciding(row), self.versions(task))
-            if reason:
+            reason = None if row is None else _record(row).why_not(self.basis(task), PER_TASK)
+            if reason is not None:
                 outdated[f"episodes, made with {reason}"] += 1
         identity.refuse_unasked(outdated, self.folder, REMAKE)
+
+    def basis(self, task: EvaluationTask) -> Basis:
+        """Return everything that the result of an episode depends on."""
+        return Basis.of(self.episode(task), self.versions(task))
 
     def versions(self, task: EvaluationTask) -> dict[str, str]:
         """Return name to version of everything that decides a result besides task, settings and policy."""
@@ -196,17 +201,10 @@ class Evaluation:
         )
 
 
-def _deciding(row: EpisodeResult) -> dict[str, str]:
-    """Return the versions that decide whether a result is up to date."""
-    return {name: value for name, value in row.versions.items() if name not in RECORDED}
-
-
-def _differences(then: dict[str, str], now: dict[str, str]) -> str:
-    """Describe the differences of versions like ``identity.differences``, in equal words for all tasks."""
-    per_task = [f"other {name}" for name in PER_TASK if then.get(name) != now.get(name)]
-    common_then = {name: value for name, value in then.items() if name not in PER_TASK}
-    common_now = {name: value for name, value in now.items() if name not in PER_TASK}
-    return ", ".join(filter(None, [*per_task, identity.differences(common_then, common_now)]))
+def _record(row: EpisodeResult) -> Record:
+    """Return the record of a stored result."""
+    deciding = {name: value for name, value in row.versions.items() if name not in RECORDED}
+    return Record(Basis.of(row.episode, deciding))
 
 
 @cache

@@ -7,7 +7,7 @@ imports it, so methods import the heavy libraries that they need.
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -19,6 +19,7 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
 from pipeline.identity import Step
+from pipeline.record import Basis, Record
 from pipeline.types import Extra
 
 Row = Mapping[str, Any]
@@ -28,22 +29,34 @@ Options = TypeVar("Options", bound=BaseModel)
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Record):
     """The record of a finished dataset, in ``data/<run>/<format>.json``.
 
     Attributes:
-        identity: digest of everything that the dataset's bytes depend on.
-        asked: digest of the requested part of it: the episodes and the options.
-        made_with: the other part of it, in words.
-        files: all files below the format's folder, each with its SHA-256.
         places: episode id to the format's columns of the manifest.
     """
 
-    identity: str
-    files: Mapping[str, str]
-    places: Mapping[str, Mapping[str, Any]]
-    asked: str = ""
-    made_with: Mapping[str, str] = field(default_factory=dict)
+    places: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "Export":
+        """Return the record that ``to_json`` wrote, in this version or an earlier one.
+
+        Raises:
+            LookupError, TypeError, ValueError: when the content is not such a record.
+        """
+        basis = Basis(content["identity"], content.get("asked", ""), content.get("made_with", {}))
+        return cls(basis, dict(content["files"]), content["places"])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of the file."""
+        return {
+            "identity": self.basis.identity,
+            "files": self.files,
+            "places": self.places,
+            "asked": self.basis.requested,
+            "made_with": self.basis.made_with,
+        }
 
 
 class Format(ABC, Generic[Options]):
@@ -111,9 +124,8 @@ class Format(ABC, Generic[Options]):
             PipelineError: when the record is missing or unreadable.
         """
         try:
-            record = Export(**json.loads(self.record_file.read_text()))
-            return replace(record, files=dict(record.files))
-        except (OSError, ValueError, TypeError) as error:
+            return Export.from_json(json.loads(self.record_file.read_text()))
+        except (OSError, LookupError, TypeError, ValueError) as error:
             raise PipelineError(f"no finished dataset ({error})", where=self.record_file, remedy=MAKE_AGAIN) from error
 
     def written(self) -> list[Written]:

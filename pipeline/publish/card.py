@@ -25,7 +25,8 @@ from pipeline.libero.tasks import SUITES
 from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, named, origins, tally, targets, tried
-from pipeline.run.run import CARD, FINETUNE, MANIFEST, SHEETS, Run
+from pipeline.run.layout import CARD, FINETUNE, MANIFEST, SHEETS
+from pipeline.run.run import Run
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """Files in the run's folder from which the card is generated, in addition to the manifest."""

@@ -23,12 +23,13 @@ from huggingface_hub.hf_api import RepoFile
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import checksum, read_json
 from pipeline.formats.base import Format
-from pipeline.generated import record, unchanged
+from pipeline.generated import read_record, unchanged
 from pipeline.grouping import grouped
 from pipeline.publish.card import REPOSITORY
 from pipeline.publish.repository import UPLOAD, Content, LastUpload, Repository, content_of, deletions, files_of, read
 from pipeline.run.export import OFT_STATISTICS
-from pipeline.run.run import CARD, FINETUNE, Run
+from pipeline.run.layout import CARD, FINETUNE
+from pipeline.run.run import Run
 
 FAILURES = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
 """Errors of an upload. Only huggingface-hub before version 1 has a ``XetError``; only later versions use httpx."""
@@ -96,11 +97,11 @@ def prepare(target: Format[Any], run: Run) -> Upload:
     sha256 = {target.repository_path(path): sha256 for path, sha256 in recorded.items()}
     others: dict[str, Path] = {}
     for folder, below, inside in ((CARD, target.name, ""), (FINETUNE, "", f"{FINETUNE}/")):
-        checksums = record(run.path(folder)).files
+        checksums = read_record(run.path(folder)).files
         for path, source in unchanged(run.path(folder), below).items():
             name = inside + path.removeprefix(f"{below}/")
             others[name], sha256[name] = source, checksums[path]
-    for name, recorded_sha256 in record(run.path(CARD)).made_from.items():
+    for name, recorded_sha256 in read_record(run.path(CARD)).basis.requested.items():
         source = run.path(name)
         if source.is_symlink() or checksum(source) != recorded_sha256:
             raise PipelineError(

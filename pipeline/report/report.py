@@ -29,7 +29,8 @@ from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
 from pipeline.run.counts import Counts, Rows, by_axis
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.run import LEAKAGE, PREVIEWS, SHEETS, Run
+from pipeline.run.layout import LEAKAGE, PREVIEWS, SHEETS
+from pipeline.run.run import Run
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Quality

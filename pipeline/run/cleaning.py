@@ -7,7 +7,7 @@ from typing import NamedTuple
 from pipeline.files import remove
 from pipeline.formats.registry import FAILURES
 from pipeline.run.foreign import refuse_foreign_files
-from pipeline.run.run import (
+from pipeline.run.layout import (
     CARD,
     COUNTS,
     FINETUNE,
@@ -26,8 +26,8 @@ from pipeline.run.run import (
     TRAJECTORIES,
     VALIDATION,
     WORK,
-    Run,
 )
+from pipeline.run.run import Run
 from pipeline.run.stage import locked, refuse_unmarked
 
 

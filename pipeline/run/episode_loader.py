@@ -12,6 +12,7 @@ from pipeline.identity import versions
 from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
+from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Episode, Extra, Subtask
@@ -33,10 +34,10 @@ class EpisodeLoader:
 
     @cached_property
     def _frames(self) -> FrameStore:
-        return FrameStore(self.data / "frames", self.config)
+        return FrameStore(self.data / FRAMES, self.config)
 
     def __call__(self, episode_id: str) -> Episode:
-        row = _rows_by_id(edition(self.data / "plan.parquet"))[episode_id]
+        row = _rows_by_id(edition(self.data / PLAN))[episode_id]
         streams = streams_of(row.perturbations)
         stream_ids = [stream.stream_id for stream in streams.values()]
         geometry = {view: stream.geometry.stream_id for view, stream in streams.items()}
@@ -45,7 +46,7 @@ class EpisodeLoader:
         values |= asdict(rendered.quality) if rendered.quality else {}
         values |= {f"{name}_version": version for name, version in versions().items()}
         if "outcome" in self.extras:
-            verdict = TrajectoryStore(self.data / "trajectories").load(row.trajectory_id).verdict
+            verdict = TrajectoryStore(self.data / TRAJECTORIES).load(row.trajectory_id).verdict
             values |= {"success": verdict.kept, "reason": verdict.reason}
         episode = Episode(
             episode_id=episode_id,
@@ -61,7 +62,7 @@ class EpisodeLoader:
         )
         if self.rewrites is None:
             return episode
-        subtasks = _subtasks(self.data / "trajectories", row.trajectory_id, row.suite, row.task)
+        subtasks = _subtasks(self.data / TRAJECTORIES, row.trajectory_id, row.suite, row.task)
         return replace(episode, rewrites=self.rewrites[episode_id], subtasks=subtasks)
 
 

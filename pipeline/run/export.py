@@ -11,7 +11,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -34,8 +33,9 @@ from pipeline.files import (
 )
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
-from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
+from pipeline.identity import PACKAGES, RECIPES, made_with, refuse_unasked
 from pipeline.libero.tasks import find_task
+from pipeline.record import Basis
 from pipeline.run.outcome import shuffled
 from pipeline.run.run import Run
 from pipeline.seeding import digest
@@ -96,7 +96,7 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
     """
     sets = target.sets(target.pieces(episodes)) if episodes.ids else set()
     # Records in the work folder are of killed calls.
-    records = [Export(**read_json(file)) for file in target.work.glob(f"*/{FINISHED}")]
+    records = [Export.from_json(read_json(file)) for file in target.work.glob(f"*/{FINISHED}")]
     with suppress(PipelineError):  # The dataset has no record, or has changed since.
         records.append(target.record())
     recorded: set[str] = set()
@@ -150,9 +150,10 @@ def wordings(axis: LanguageAxis | None, suite: str, task: str, axes: str) -> tup
     return (axis or LanguageAxis()).wordings(find_task(suite, task), axes.split("+"), benchmark.load())
 
 
-def identity(target: AnyFormat, episodes: Episodes) -> str:
-    """Return a short digest of everything that the bytes of a dataset depend on."""
-    return digest(
+def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:
+    """Return everything that the bytes of a dataset depend on: what is requested are episodes and options."""
+    contents = [episode.content for episode in episodes.known.values()]
+    identity = digest(
         "export",
         target.name,
         RECIPES[target.name],
@@ -161,14 +162,11 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
         _options(target),
         target.extras,
         [[piece.path, piece.ids] for piece in target.pieces(episodes)],
-        [episode.content for episode in episodes.known.values()],
-    )[:16]
-
-
-def request(target: AnyFormat, episodes: Episodes) -> str:
-    """Return a short digest of the requested part of ``identity``: the episodes with their content, and the options."""
-    content = [episode.content for episode in episodes.known.values()]
-    return digest(_options(target), target.extras, content)[:16]
+        contents,
+    )
+    requested = digest(_options(target), target.extras, contents)[:16]
+    schema = digest(SCHEMA.model_dump(mode="json"))[:8]
+    return Basis(identity[:16], requested, {**made_with(target.name), "episode schema": schema})
 
 
 def _options(target: AnyFormat) -> dict[str, Any]:
@@ -183,13 +181,10 @@ def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
         record = target.record()
     except PipelineError:
         return Counter()
-    if record.asked != request(target, episodes) or record.identity == identity(target, episodes):
+    basis = compute_basis(target, episodes)
+    if record.matches(basis) or not record.same_request(basis):
         return Counter()
-    return Counter({f"files, made with {differences(record.made_with, _made_with(target))}": len(record.files)})
-
-
-def _made_with(target: AnyFormat) -> dict[str, str]:
-    return {**made_with(target.name), "episode schema": digest(SCHEMA.model_dump(mode="json"))[:8]}
+    return Counter({f"files, made with {record.why_not(basis)}": len(record.files)})
 
 
 def is_current(target: AnyFormat, episodes: Episodes) -> bool:
@@ -198,7 +193,7 @@ def is_current(target: AnyFormat, episodes: Episodes) -> bool:
     Every file must exist and be no younger than the record. If so, statistics that a client stored in the sets are
     removed.
     """
-    if not untouched(target) or target.record().identity != identity(target, episodes):
+    if not untouched(target) or not target.record().matches(compute_basis(target, episodes)):
         return False
     keep_below(target.folder, {target.folder / name for name in target.record().files})
     _clear_work(target)
@@ -241,8 +236,8 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         PipelineError: when an episode breaks the schema or the ids are unfit. The earlier dataset stays; whole pieces
             stay in the work folder.
     """
-    pieces = target.pieces(episodes)
-    work = target.work / identity(target, episodes)
+    pieces, basis = target.pieces(episodes), compute_basis(target, episodes)
+    work = target.work / basis.identity
     keep_below(target.work, {work})
     finished = work / FINISHED
     if not finished.is_file():
@@ -255,8 +250,8 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         checksums = workers(checksum, paths, f"{target.title} checksums")
         files = {path.relative_to(dataset).as_posix(): sha256 for path, sha256 in zip(paths, checksums, strict=True)}
         with replaced(finished) as temporary:
-            record = Export(work.name, files, places, request(target, episodes), _made_with(target))
-            temporary.write_text(json.dumps(asdict(record), indent=0) + "\n")
+            record = Export(basis, files, places)
+            temporary.write_text(json.dumps(record.to_json(), indent=0) + "\n")
     _replace(target, work)
 
 

@@ -6,7 +6,7 @@ The memory is a file of ``data/<run>/.finished/``. To have a stage work again, d
 import json
 import platform
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path, PurePath
@@ -19,9 +19,10 @@ from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
-from pipeline.identity import RECIPES, fingerprint, versions
+from pipeline.identity import RECIPES, made_with, versions
+from pipeline.record import Basis, Record
 from pipeline.run.export import untouched
-from pipeline.run.run import (
+from pipeline.run.layout import (
     COUNTS,
     FINISHED,
     FRAMES,
@@ -36,8 +37,8 @@ from pipeline.run.run import (
     STATISTICS,
     TRAJECTORIES,
     VALIDATION,
-    Run,
 )
+from pipeline.run.run import Run
 from pipeline.seeding import digest
 from pipeline.stores.store import TABLE
 
@@ -49,42 +50,57 @@ SEEN = LIBRARY / "testset" / "seen.json"
 
 @dataclass(frozen=True)
 class Memory:
-    """Record of the inputs and the recipe that a stage's outputs were generated from.
+    """Place of the record of a stage's outputs.
 
     Attributes:
         data: folder of the run.
         stage: name of the stage.
-        made_by: fingerprint of inputs and recipe; `None` if an input has changed since it was recorded.
+        basis: everything that the outputs depend on now; `None` if an input has changed since it was recorded.
         outputs: files or folders of ``data``.
     """
 
     data: Path
     stage: str
-    made_by: str | None
+    basis: Basis | None
     outputs: Sequence[str]
 
     def holds(self) -> bool:
         """Return whether the outputs are unchanged, and were generated from the same inputs by the same recipe."""
+        return self.why_not() is None
+
+    def why_not(self) -> str | None:
+        """Describe why the stage has to work; `None` if the outputs are up to date."""
+        if self.basis is None:
+            return "an input is missing or has changed"
         try:
-            return self.made_by is not None and read_json(self._file) == self._now()
-        except (PipelineError, OSError):
-            return False
+            record = self._read()
+        except (PipelineError, OSError, LookupError, TypeError, ValueError):
+            return "no record of an earlier call"
+        outputs = self._contents()
+        if record.matches(self.basis) and record.files != outputs:
+            changed = sorted(name for name, _ in record.files.items() ^ outputs.items())
+            return f"{changed[0]} is missing or has changed"
+        return record.why_not(self.basis)
 
     def keep(self) -> None:
         """Record the present outputs."""
         self._file.unlink(missing_ok=True)
-        if self.made_by is not None:
-            write_json(self._file, self._now())
+        if self.basis is not None:
+            write_json(self._file, asdict(Record(self.basis, self._contents())))
 
     @property
     def _file(self) -> Path:
         return self.data / FINISHED / f"{self.stage}.json"
 
-    def _now(self) -> dict[str, Any]:
-        return {"made_by": self.made_by, "outputs": _contents([self.data / name for name in self.outputs], self.data)}
+    def _read(self) -> Record:
+        content = read_json(self._file)
+        return Record(Basis(**content["basis"]), dict(content["files"]))
+
+    def _contents(self) -> Mapping[str, str]:
+        return _contents([self.data / name for name in self.outputs], self.data)
 
 
-def of_stage(
+def stage_memory(
     run: Run, name: str, settings: Mapping[str, object], inputs: Sequence[str], outputs: Sequence[str]
 ) -> Memory:
     """Return the memory of a stage whose outputs depend on this library, its settings and its input files.
@@ -96,13 +112,16 @@ def of_stage(
     """
     try:
         # The manifest states versions, also of this project.
-        packages = [versions(), *(fingerprint(step) for step in RECIPES)]
+        made_with_all = dict(versions())
+        for step in RECIPES:
+            made_with_all.update(made_with(step))
     except (PipelineError, PackageNotFoundError):
         # The stage `doctor` reports the fault.
         return Memory(run.folder, name, None, outputs)
+    made_with_all["code"] = library()[:16]
     contents = _contents([run.path(file) for file in inputs], run.folder)
-    made_by = digest(library(), packages, dict(settings), contents)
-    return Memory(run.folder, name, made_by, outputs)
+    basis = Basis.of({"settings": dict(settings), "files": contents}, made_with_all)
+    return Memory(run.folder, name, basis, outputs)
 
 
 @cache
@@ -113,7 +132,7 @@ def library() -> str:
     return digest(content, SCHEMA.model_dump(mode="json"))
 
 
-def of_validate(run: Run) -> Memory:
+def validate_memory(run: Run) -> Memory:
     """Return the memory of ``validate``: it passed on these contents, and nothing has changed since."""
     stores, formats = (run.trajectories, run.frames), run.recorded_formats
     files = [run.path(name) for name in (PLAN, MANIFEST, COUNTS, STATISTICS, INPUTS)]
@@ -122,15 +141,21 @@ def of_validate(run: Run) -> Memory:
     stores_whole = all(store.untouched() for store in stores)
     whole = stores_whole and all(untouched(dataset) for dataset in formats)
     config = run.config
-    sections = [settings_of(section) for section in (config.render, config.export, config.plan.axes)]
-    settings = [*sections, checksum(BANK_FILE)]
-    made_by = fingerprint("checks", *settings, _contents(files, run.folder)) if whole else None
-    return Memory(run.folder, "validate", made_by, [VALIDATION])
+    settings = {
+        "render": settings_of(config.render),
+        "export": settings_of(config.export),
+        "axes": settings_of(config.plan.axes),
+        "bank of rewrites": checksum(BANK_FILE),
+    }
+    requested = {"settings": settings, "files": _contents(files, run.folder)}
+    basis = Basis.of(requested, made_with("checks")) if whole else None
+    return Memory(run.folder, "validate", basis, [VALIDATION])
 
 
-def of_doctor(run: Run, device: str) -> Memory:
+def trial_memory(run: Run, device: str) -> Memory:
     """Return the memory of a trial of this machine."""
-    return Memory(run.folder, "trial", fingerprint("pixels", device, *host()), [MACHINE])
+    basis = Basis.of({"host": host()}, {**made_with("pixels"), "OpenGL device": device})
+    return Memory(run.folder, "trial", basis, [MACHINE])
 
 
 def host() -> list[list[str]]:
@@ -141,34 +166,41 @@ def host() -> list[list[str]]:
     return [list(platform.uname()), sorted(models)]
 
 
-def of_summary(run: Run) -> Memory:
+def summary_memory(run: Run) -> Memory:
     """Return the memory of the contact sheets and previews."""
     names = (PLAN, MANIFEST, INPUTS, FRAMES_TABLE)
-    return _of_pictures(run, "summary", [SHEETS, PREVIEWS], _drawn_by(run.config), names)
+    return _pictures_memory(run, "summary", [SHEETS, PREVIEWS], _drawn_by(run.config), names)
 
 
-def of_previews(run: Run) -> Memory:
+def previews_memory(run: Run) -> Memory:
     """Return the memory of the previews, which show no episode and so do not depend on kept or exported episodes."""
-    return _of_pictures(run, "previews", [PREVIEWS], _drawn_by(run.config), [INPUTS])
+    return _pictures_memory(run, "previews", [PREVIEWS], _drawn_by(run.config), [INPUTS])
 
 
-def of_report(run: Run) -> Memory:
+def report_memory(run: Run) -> Memory:
     """Return the memory of the report."""
     names = (PLAN, MANIFEST, LEAKAGE, INPUTS, FRAMES_TABLE, SHEETS, PREVIEWS)
-    settings = [settings_of(run.config, {"compute", "folder", "publish"}), checksum(SEEN)]
-    return _of_pictures(run, "report", [REPORT], settings, names)
+    settings = {
+        **settings_of(run.config, {"compute", "folder", "publish"}),
+        "measures of the test tasks": checksum(SEEN),
+    }
+    return _pictures_memory(run, "report", [REPORT], settings, names)
 
 
-def _of_pictures(
-    run: Run, stage: str, outputs: Sequence[str], settings: Sequence[object], names: Sequence[str]
+def _pictures_memory(
+    run: Run, stage: str, outputs: Sequence[str], settings: Mapping[str, object], names: Sequence[str]
 ) -> Memory:
     whole = FRAMES_TABLE not in names or run.frames.untouched()
-    contents = _contents([run.path(name) for name in names], run.folder)
-    return Memory(run.folder, stage, fingerprint("pictures", *settings, contents) if whole else None, outputs)
+    requested = {"settings": settings, "files": _contents([run.path(name) for name in names], run.folder)}
+    return Memory(run.folder, stage, Basis.of(requested, made_with("pictures")) if whole else None, outputs)
 
 
-def _drawn_by(config: Config) -> list[dict[str, Any]]:
-    return [settings_of(section) for section in (config.demos, config.plan, config.replay)]
+def _drawn_by(config: Config) -> dict[str, object]:
+    return {
+        "demos": settings_of(config.demos),
+        "plan": settings_of(config.plan),
+        "replay": settings_of(config.replay),
+    }
 
 
 def _contents(paths: Sequence[Path], data: Path) -> Mapping[str, str]:

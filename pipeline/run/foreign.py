@@ -8,6 +8,7 @@ from pathlib import Path
 from pipeline.axes import AXES
 from pipeline.errors import PipelineError
 from pipeline.files import is_temporary
+from pipeline.run.layout import CARD, FINETUNE, FRAMES, PREVIEWS, SHEETS, TRAJECTORIES
 from pipeline.stores.store import EARLIER_SUFFIX, SUFFIX, TABLE
 
 _AXIS = rf"({'|'.join(AXES)})"
@@ -16,17 +17,17 @@ _STORED = rf"({re.escape(SUFFIX)}|{re.escape(EARLIER_SUFFIX)})"
 _ID = "[0-9a-f]{16}"
 
 CLEARED = {
-    "trajectories": rf"{re.escape(TABLE)}|{_ID}{_STORED}",
-    "frames": rf"{re.escape(TABLE)}|{_ID}/{_ID}{_STORED}",
-    "sheets": _SHEET,
-    "previews": rf"[a-z0-9_]+/{_AXIS}\.png",
+    TRAJECTORIES: rf"{re.escape(TABLE)}|{_ID}{_STORED}",
+    FRAMES: rf"{re.escape(TABLE)}|{_ID}/{_ID}{_STORED}",
+    SHEETS: _SHEET,
+    PREVIEWS: rf"[a-z0-9_]+/{_AXIS}\.png",
 }
 """Map of the folders that stages clear to a pattern of the paths that stages write in them."""
 
 MADE = {
     **CLEARED,
-    "card": rf"\.generated\.json|(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
-    "finetune": r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|"
+    CARD: rf"\.generated\.json|(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
+    FINETUNE: r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|"
     r"starvla_data_config\.py|openpi_assets/physical-intelligence/libero/norm_stats\.json",
 }
 """``CLEARED`` with the folders whose stages look for edits themselves. ``clean`` deletes all of them."""

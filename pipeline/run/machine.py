@@ -19,7 +19,8 @@ from pipeline.files import read_json, write_json
 from pipeline.identity import fingerprint, made_with
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.run.run import FINISHED, FRAMES, MACHINE, TRAJECTORIES, Run
+from pipeline.run.layout import FINISHED, FRAMES, MACHINE, TRAJECTORIES
+from pipeline.run.run import Run
 from pipeline.stores.store import SUFFIX
 
 SPEED = f"{FINISHED}/speed.json"

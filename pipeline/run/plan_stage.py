@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pipeline.config import Config
 from pipeline.identity import made_with
 from pipeline.planning import plan
+from pipeline.record import Basis
 from pipeline.run import inputs
 from pipeline.run.finished import Memory, library
-from pipeline.run.run import PLAN, Run
-from pipeline.seeding import digest
+from pipeline.run.layout import PLAN
+from pipeline.run.run import Run
 from pipeline.stores.store import TABLE
 from pipeline.testset import benchmark
 
@@ -56,5 +57,6 @@ def memory(run: Run) -> Memory:
     config = run.config
     settings = inputs.settings(config)
     sections = {name: settings[name] for name in ("demos", "plan", "replay")}
-    made_by = digest(sections, inputs.listing(config), library(), made_with("physics"))
-    return Memory(run.folder, "plan", made_by, [PLAN])
+    requested = {"settings": sections, "files": inputs.listing(config)}
+    basis = Basis.of(requested, {**made_with("physics"), "code": library()[:16]})
+    return Memory(run.folder, "plan", basis, [PLAN])

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
@@ -53,24 +52,25 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
     return needed_portions
 
 
-def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, workers: Workers) -> set[str]:
-    """Render the streams that ``folder`` lacks of every kept episode, and of failures if the configuration asks.
+def render_plan(
+    rows: Sequence[Row], config: Config, trajectories: TrajectoryStore, frames: FrameStore, workers: Workers
+) -> set[str]:
+    """Render the streams that ``frames`` lacks of every kept episode, and of failures if the configuration asks.
 
     Reserves replace episodes with rejected frames. Rendering therefore repeats until it has generated all files that it
     can from the stored trajectories.
 
     Returns:
-        The files of ``folder`` that the plan needs. They do not depend on what was rendered before.
+        The files of ``frames`` that the plan needs. They do not depend on what was rendered before.
 
     Raises:
         PipelineError: when rendering leaves the same work undone.
     """
     device = gl.choose().device
-    store = FrameStore(folder, config.render)
-    judged = verdicts_of(TrajectoryStore(trajectories).rows(), rows, config.filter)
+    judged = verdicts_of(trajectories.rows(), rows, config.filter)
     undone: set[str] = set()
     while True:
-        stored = {name: row for name, row in store.refresh().items() if row["device"] == device}
+        stored = {name: row for name, row in frames.refresh().items() if row["device"] == device}
         needed = _needed(rows, judged, rejections(rows, shown_of(stored)), MISSED if config.export.failures else ())
         missing = {name: portion for name, portion in needed.items() if name not in stored}
         if not missing:
@@ -78,7 +78,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
         if missing.keys() == undone:
             raise PipelineError(
                 f"{len(missing)} files of frames were rendered and are still not there, such as this one",
-                where=store.path(next(iter(missing))),
+                where=frames.path(next(iter(missing))),
                 expected=f"files written there by workers, rendered on {device}",
                 remedy="check that all workers see this folder and have the same versions and OpenGL device",
             )
@@ -87,7 +87,9 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
         from pipeline.rendering.renderer import scene_of_process
         from pipeline.run.render_job import RenderJob
 
-        jobs = [RenderJob(*portion, trajectories, folder, config.render, device) for portion in missing.values()]
+        jobs = [
+            RenderJob(*portion, trajectories.root, frames.root, config.render, device) for portion in missing.values()
+        ]
         # Jobs of many streams come first, so that none of them runs alone at the end. In jobs of few streams the scene
         # takes most of the time. They are ordered by task and demonstration, as a worker keeps shared parts of scenes.
         jobs.sort(key=lambda job: (-len(job.streams), job.row.suite, job.row.task, job.row.demo_id))

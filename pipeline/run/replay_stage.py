@@ -23,13 +23,13 @@ class Replays:
     Attributes:
         demos: the section ``demos``.
         config: the section ``replay``.
-        folder: folder of the trajectories.
+        store: store of the trajectories.
         limits: the section ``filter``.
     """
 
     demos: DemosConfig
     config: ReplayConfig
-    folder: Path
+    store: TrajectoryStore
     workers: Workers
     limits: FilterConfig = NO_LIMITS
 
@@ -47,8 +47,7 @@ class Replays:
         Raises:
             PipelineError: when workers leave work undone.
         """
-        store = TrajectoryStore(self.folder)
-        stored = verdicts_of(store.refresh(), rows, self.limits)
+        stored = verdicts_of(self.store.refresh(), rows, self.limits)
         twins = [row for row in rows if row.role == "twin"]
         verdicts: dict[str, Verdict] = {}
         for group in (twins, rows):
@@ -56,9 +55,9 @@ class Replays:
                 missing = [trajectory_id for trajectory_id in needed if trajectory_id not in stored]
                 if missing:
                     self._replay(missing, rows)
-                    stored = verdicts_of(store.refresh(), rows, self.limits)
+                    stored = verdicts_of(self.store.refresh(), rows, self.limits)
                     undone = [trajectory_id for trajectory_id in missing if trajectory_id not in stored]
-                    _refuse_undone([store.path(trajectory_id) for trajectory_id in undone])
+                    _refuse_undone([self.store.path(trajectory_id) for trajectory_id in undone])
                 verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed}
         return verdicts
 
@@ -70,7 +69,7 @@ class Replays:
         twin_of = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
         # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
         in_turn = sorted(map(row_of.__getitem__, missing), key=lambda row: row.demo_id)
-        jobs = [ReplayJob(row, twin_of[row.demo_id], self.demos, self.config, self.folder) for row in in_turn]
+        jobs = [ReplayJob(row, twin_of[row.demo_id], self.demos, self.config, self.store.root) for row in in_turn]
         self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
 
 

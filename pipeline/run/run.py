@@ -14,31 +14,11 @@ from pipeline.formats.registry import failures_of, formats_of, recorded
 from pipeline.planning import plan
 from pipeline.run import manifest, outcome
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.layout import FRAMES, MANIFEST, PLAN, REPORT, TRAJECTORIES, VALIDATION
 from pipeline.run.outcome import Outcome
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Extra
-
-PLAN = "plan.parquet"
-MANIFEST = "manifest.parquet"
-INPUTS = "inputs.json"
-SETTINGS = "settings.json"
-MACHINE = "machine.json"
-LEAKAGE = "leakage.json"
-REPLAY = "replay.json"
-STATISTICS = "dataset_statistics.json"
-COUNTS = "counts.json"
-VALIDATION = "validation.json"
-TRAJECTORIES = "trajectories"
-FRAMES = "frames"
-FINETUNE = "finetune"
-SHEETS = "sheets"
-PREVIEWS = "previews"
-CARD = "card"
-REPORT = "report.html"
-WORK = ".work"
-FINISHED = ".finished"
-"""Names of the files and folders of a run."""
 
 AnyFormat = Format[Any]
 
@@ -63,7 +43,7 @@ class Run:
         return Run(self.config, self.folder.resolve())
 
     def path(self, name: str) -> Path:
-        """Return the path of a file or folder of the run, by one of the names of this module."""
+        """Return the path of a file or folder of the run, by one of the names of ``layout.py``."""
         return self.folder / name
 
     @property

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
 from pipeline.files import keep_below, replaced
-from pipeline.identity import Step, differences, fingerprint, made_with
+from pipeline.identity import Step, fingerprint, made_with
+from pipeline.record import Basis, Record
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import BrokenSealError, SealedFile, seal, unsealed
 from pipeline.tables import read_table, write_table
@@ -62,11 +63,15 @@ class Store(ABC):
     def __init__(self, root: Path, settings: object = None, form: Mapping[str, object] = MappingProxyType({})):
         self.root = root
         parts = [settings, *form.values()] if settings is not None else []
-        self.made_by = fingerprint(self.step, *parts)
-        here = {**made_with(self.step), **{name: digest(value)[:8] for name, value in form.items()}}
-        self._made_with: dict[str, Any] = {"made_with": here, "settings": settings}
+        form_digests = {name: digest(value)[:8] for name, value in form.items()}
+        self.basis = Basis(fingerprint(self.step, *parts), settings, {**made_with(self.step), **form_digests})
         common = {"file": pa.string(), "made_by": pa.string(), "bytes": pa.int64()}
         self._schema = pa.schema(list((common | dict(self.columns)).items()))
+
+    @property
+    def made_by(self) -> str:
+        """Return the fingerprint of the files that this store writes."""
+        return self.basis.identity
 
     @staticmethod
     @abstractmethod
@@ -168,7 +173,7 @@ class Store(ABC):
 
     def settings_by_fingerprint(self) -> dict[str, object]:
         """Map each fingerprint of the table's metadata to the settings that its files were written with."""
-        return {made_by: made_with["settings"] for made_by, made_with in self._known().items()}
+        return {made_by: record.basis.requested for made_by, record in self._records().items()}
 
     def row(self, name: str) -> dict[str, Any] | None:
         """Read one row from its file; `None` if the file is missing or not up to date.
@@ -206,9 +211,9 @@ class Store(ABC):
     def refresh(self) -> dict[str, dict[str, Any]]:
         """Return ``rows`` and write them as the table; only for the stage that generates the files."""
         rows, table_up_to_date = self._rows()
-        made_with_of = self._known()
-        if not table_up_to_date or self.made_by not in made_with_of:
-            self._write(rows, made_with_of | {self.made_by: self._made_with})
+        records = self._records()
+        if not table_up_to_date or self.made_by not in records:
+            self._write(rows, records | {self.made_by: Record(self.basis)})
         return rows
 
     def keep(self, names: Iterable[str]) -> None:
@@ -219,22 +224,29 @@ class Store(ABC):
 
         keep_below(self.root, {self.root / TABLE, *map(self.path, names)}, made)
         rows = self.refresh()
-        if self._known().keys() - {self.made_by} and len(rows) == len(self.names()):
-            self._write(rows, {self.made_by: self._made_with})
+        if self._records().keys() - {self.made_by} and len(rows) == len(self.names()):
+            self._write(rows, {self.made_by: Record(self.basis)})
 
-    def _write(self, rows: Mapping[str, Mapping[str, Any]], made_with_of: Mapping[str, Any]) -> None:
+    def _write(self, rows: Mapping[str, Mapping[str, Any]], records: Mapping[str, Record]) -> None:
         listed = [row for _, row in sorted(rows.items())]
+        made_with_of = {
+            made_by: {"made_with": dict(record.basis.made_with), "settings": record.basis.requested}
+            for made_by, record in records.items()
+        }
         schema = self._schema.with_metadata({_MADE_WITH: json.dumps(made_with_of, sort_keys=True)})
         write_table(pa.Table.from_pylist(listed, schema=schema), self.root / TABLE)
 
-    def _known(self) -> dict[str, dict[str, Any]]:
-        """Map the fingerprints in the table's metadata to the recipes, packages and settings of their files."""
+    def _records(self) -> dict[str, Record]:
+        """Map the fingerprints in the table's metadata to the records of their files."""
         try:
             metadata = pq.read_schema(self.root / TABLE).metadata
             made_with_of: dict[str, dict[str, Any]] = json.loads(metadata[_MADE_WITH])
+            return {
+                made_by: Record(Basis(made_by, content["settings"], content["made_with"]))
+                for made_by, content in made_with_of.items()
+            }
         except (OSError, pa.ArrowException, LookupError, TypeError, ValueError):
             return {}
-        return made_with_of
 
     def outdated(self, names: Iterable[str]) -> Counter[str]:
         """Count, by reason, the finished files that count as missing.
@@ -244,7 +256,7 @@ class Store(ABC):
         Raises:
             PipelineError: when a file is damaged.
         """
-        up_to_date, made_with_of = self.rows(), self._known()
+        up_to_date, records = self.rows(), self._records()
         reasons: Counter[str] = Counter()
         for name in names:
             if name in up_to_date:
@@ -254,9 +266,9 @@ class Store(ABC):
                     reasons["the HDF5 container of an earlier version"] += 1
                 continue
             with self._readable(name) as file:
-                then = made_with_of.get(str(file.attributes["made_by"]))
-            if then is None:
+                record = records.get(str(file.attributes["made_by"]))
+            if record is None:
                 reasons["something that was not written down"] += 1
-            elif then["settings"] == self._made_with["settings"]:
-                reasons[differences(then["made_with"], self._made_with["made_with"])] += 1
+            elif record.same_request(self.basis):
+                reasons[str(record.why_not(self.basis))] += 1
         return reasons

@@ -27,6 +27,7 @@ from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import export
+from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.run.render_job import RenderJob
 from pipeline.run.replay_job import ReplayJob
 from pipeline.stores.frame_store import FrameStore, shown_of
@@ -111,9 +112,9 @@ def _rebuild(
             where=row["demo_id"],
             expected=f"content with the hash {row['demo_sha256']}",
         )
-    trajectories, frames = out / "trajectories", out / "frames"
+    trajectories, frames = out / TRAJECTORIES, out / FRAMES
     planned, planned_twin = _plan_row(row), _plan_row(twin)
-    plan.write([planned], out / "plan.parquet")
+    plan.write([planned], out / PLAN)
 
     def replay(each: plan.Row) -> Verdict:
         return ReplayJob(each, planned_twin.trajectory_id, demos, settings.replay, trajectories)()

@@ -14,19 +14,9 @@ from pipeline.generated import FOLDERS, edits, edits_in_words
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
 from pipeline.run import cleaning, counts, dropped, export, finished, inputs, machine, outcome, plan_stage
+from pipeline.run.layout import CARD, COUNTS, FINETUNE, INPUTS, LEAKAGE, MACHINE, MANIFEST, SETTINGS, STATISTICS
 from pipeline.run.outcome import outdated
-from pipeline.run.run import (
-    CARD,
-    COUNTS,
-    FINETUNE,
-    INPUTS,
-    LEAKAGE,
-    MACHINE,
-    MANIFEST,
-    SETTINGS,
-    STATISTICS,
-    Run,
-)
+from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import Shown, shown_of
 from pipeline.types import Verdict
@@ -148,7 +138,7 @@ def _follow(run: Run) -> Iterator[tuple[str, str]]:
         episodes = export.episodes_of(dataset, run)
         if not export.untouched(dataset):
             why = "there is no dataset, or files of it have changed"
-        elif dataset.record().identity != export.identity(dataset, episodes):
+        elif not dataset.record().matches(export.compute_basis(dataset, episodes)):
             reason = next(iter(export.outdated(dataset, episodes)), "files of other episodes or options")
             why = f"the dataset has {reason}"
         else:
@@ -158,10 +148,10 @@ def _follow(run: Run) -> Iterator[tuple[str, str]]:
     if stale:
         yield "manifest and all that follows", "the datasets are not those"
         return
-    memories = {"validate": finished.of_validate, "summary": finished.of_summary, "report": finished.of_report}
-    for stage, memory in memories.items():
-        if not memory(run).holds():
-            yield stage, "not made from these files"
+    for memory in (finished.validate_memory(run), finished.summary_memory(run), finished.report_memory(run)):
+        changed = memory.why_not()
+        if changed is not None:
+            yield memory.stage, changed
 
 
 def _why_planned(run: Run) -> str:

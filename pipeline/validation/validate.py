@@ -30,7 +30,8 @@ from pipeline.run import outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import wordings
-from pipeline.run.run import COUNTS, STATISTICS, WORK, Run
+from pipeline.run.layout import COUNTS, STATISTICS, WORK
+from pipeline.run.run import Run
 from pipeline.types import Extra
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS

@@ -10,7 +10,8 @@ from pipeline.files import read_json
 from pipeline.formats.read_back import Written
 from pipeline.planning import plan
 from pipeline.run import manifest
-from pipeline.run.run import COUNTS, LEAKAGE, STATISTICS, Run
+from pipeline.run.layout import COUNTS, LEAKAGE, STATISTICS
+from pipeline.run.run import Run
 from pipeline.stores.store import TABLE, Store
 from pipeline.tables import read_table
 

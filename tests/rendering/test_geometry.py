@@ -35,6 +35,7 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import export
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
+from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
@@ -169,8 +170,8 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config, data = Config.model_validate(fields), tmp_path_factory.mktemp("run")
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
     plan.write(rows, data / "plan.parquet")
-    judged = Replays(config.demos, config.replay, data / "trajectories", loop).of(rows)
-    render_plan(rows, config, data / "trajectories", data / "frames", loop)
+    judged = Replays(config.demos, config.replay, TrajectoryStore(data / "trajectories"), loop).of(rows)
+    render_plan(rows, config, TrajectoryStore(data / "trajectories"), FrameStore(data / "frames", config.render), loop)
     outcome = selection.select(rows, judged)
     kept = [row for row in rows if outcome[row.episode_id].kept]
     load = EpisodeLoader(data, config.render)

@@ -12,10 +12,10 @@ from pipeline import identity
 from pipeline.config import Config, load
 from pipeline.formats.registry import formats_of
 from pipeline.run import export
-from pipeline.run.finished import Memory, of_previews, of_report, of_summary, of_validate
+from pipeline.run.finished import Memory, previews_memory, report_memory, summary_memory, validate_memory
 from pipeline.run.run import Run
 
-REMEMBERED: tuple[Callable[[Run], Memory], ...] = (of_validate, of_summary, of_report, of_previews)
+REMEMBERED: tuple[Callable[[Run], Memory], ...] = (validate_memory, summary_memory, report_memory, previews_memory)
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[boo
 def test_what_found_something_off_is_not_remembered(config: Config) -> None:
     rot(largest(config.data / "rlds"))
     (config.data / "validation.json").unlink()
-    assert not of_validate(Run(config)).holds(), "so everything is read again, also what looks unchanged"
+    assert not validate_memory(Run(config)).holds(), "so everything is read again, also what looks unchanged"
 
 
 def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Config) -> None:

@@ -36,7 +36,8 @@ from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import episodes_of
-from pipeline.run.run import FINISHED, STATISTICS, Run
+from pipeline.run.layout import FINISHED, STATISTICS
+from pipeline.run.run import Run
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 

@@ -15,7 +15,7 @@ from conftest import Once
 
 from pipeline import gl, identity
 from pipeline.axes.light import LightPerturbation
-from pipeline.compute.pool import loop
+from pipeline.compute.pool import Workers, loop
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
@@ -28,6 +28,11 @@ from pipeline.run.render_job import RenderJob
 from pipeline.run.render_stage import STREAMS_OF_A_JOB, portions, render_plan
 from pipeline.stores.frame_store import FrameStore, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore
+
+
+def render_into(folder: Path, rows: Sequence[plan.Row], config: Config, replayed: Path, workers: Workers) -> set[str]:
+    """Render the frames of a plan into a folder, from replayed trajectories."""
+    return render_plan(rows, config, TrajectoryStore(replayed), FrameStore(folder, config.render), workers)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +95,7 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
     monkeypatch.delenv(identity.REMAKE, raising=False)
     stored = TrajectoryStore(shutil.copytree(replayed, tmp_path / "trajectories"))
     store = FrameStore(tmp_path / "frames", config.render)
-    store.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
+    store.keep(render_into(tmp_path / "frames", rows, config, replayed, loop))
     assert not outdated(rows, stored, store, gl.choose().device)
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
 
@@ -108,9 +113,9 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
     if step == "pixels":
         monkeypatch.delenv(identity.REMAKE)
         again = FrameStore(tmp_path / "frames", config.render)
-        again.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
+        again.keep(render_into(tmp_path / "frames", rows, config, replayed, loop))
         assert not outdated(rows, stored, again, gl.choose().device), "a remake is asked for once"
-        assert again._known().keys() == {again.made_by}
+        assert again.settings_by_fingerprint().keys() == {again.made_by}
 
 
 def test_what_the_user_changed_is_made_without_a_question(
@@ -118,7 +123,7 @@ def test_what_the_user_changed_is_made_without_a_question(
 ) -> None:
     stored = TrajectoryStore(shutil.copytree(replayed, tmp_path / "trajectories"))
     store = FrameStore(tmp_path / "frames", config.render)
-    store.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
+    store.keep(render_into(tmp_path / "frames", rows, config, replayed, loop))
     other = config.model_copy(update={"render": config.render.model_copy(update={"jpeg_quality": 80})})
     changed = FrameStore(tmp_path / "frames", other.render)
     assert not changed.rows()
@@ -145,14 +150,14 @@ def test_rendering_ends_when_all_streams_of_a_trajectory_are_rejected(
         passes.append(len(items))
         return loop(fn, items, description)
 
-    render_plan(lights, config, replayed, tmp_path, counted)
+    render_into(tmp_path, lights, config, replayed, counted)
     stored = shown_of(FrameStore(tmp_path, config.render).rows())
     (shown,) = stored.values()
     assert shown.streams == set()
     assert len(shown.rejected) == 4, "two views of the light episode and of its reserve"
     assert outcome.rejections(lights, stored) == dict.fromkeys((row.episode_id for row in lights), "too_dark")
     rendered = len(passes)
-    render_plan(lights, config, replayed, tmp_path, counted)
+    render_into(tmp_path, lights, config, replayed, counted)
     assert len(passes) == rendered, "a second run has nothing to do"
 
 
@@ -160,9 +165,9 @@ def test_frames_are_the_same_in_one_file_and_in_several(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As when a trajectory has more streams than a job renders."""
-    render_plan(rows, config, replayed, tmp_path / "one", loop)
+    render_into(tmp_path / "one", rows, config, replayed, loop)
     monkeypatch.setattr("pipeline.run.render_stage.STREAMS_OF_A_JOB", 1)
-    files = render_plan(rows, config, replayed, tmp_path / "several", loop)
+    files = render_into(tmp_path / "several", rows, config, replayed, loop)
     streams = {s.stream_id: s.geometry.stream_id for row in rows[:2] for s in streams_of(row.perturbations).values()}
     assert len(streams) == len(files) == 4
     one, several = (
@@ -194,7 +199,7 @@ def test_a_plan_that_grows_or_shrinks_has_the_files_of_a_first_run_and_renders_w
 
     def files(planned: Sequence[plan.Row], folder: str) -> dict[str, bytes]:
         store = FrameStore(tmp_path / folder, config.render)
-        rendered = render_plan(planned, config, replayed, tmp_path / folder, loop)
+        rendered = render_into(tmp_path / folder, planned, config, replayed, loop)
         (store.root / "0123.npz").write_bytes(b"all frames of a trajectory, as an earlier version stored them")
         store.keep(rendered)
         return {path.relative_to(store.root).as_posix(): path.read_bytes() for path in store.root.rglob("*.npz")}
@@ -212,12 +217,12 @@ def test_a_rejection_that_is_no_longer_planned_is_forgotten(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
 ) -> None:
     store, trajectory_id = FrameStore(tmp_path, config.render), rows[0].trajectory_id
-    (name,) = render_plan(rows[:1], config, replayed, tmp_path, loop)
+    (name,) = render_into(tmp_path, rows[:1], config, replayed, loop)
     geometry = [stream.geometry.stream_id for stream in streams_of(rows[0].perturbations).values()]
     twin = store.load(trajectory_id, store.rows()[name]["streams"], geometry)
     store.path(name).unlink()
     store.save(trajectory_id, replace(twin, rejected={"earlier": "too_dark"}), gl.choose().device)
-    store.keep(render_plan(rows[:1], config, replayed, tmp_path, loop))
+    store.keep(render_into(tmp_path, rows[:1], config, replayed, loop))
     (row,) = store.rows().values()
     assert json.loads(row["rejected"]) == {}
     assert row["streams"] == sorted(twin.streams)
@@ -228,7 +233,7 @@ def test_a_damaged_file_is_an_error_and_is_never_silently_rendered_again(
 ) -> None:
     monkeypatch.setattr("pipeline.run.render_stage.STREAMS_OF_A_JOB", 2)
     frames = tmp_path / "frames"
-    files = render_plan(rows, config, replayed, frames, loop)
+    files = render_into(frames, rows, config, replayed, loop)
     store = FrameStore(frames, config.render)
     whole, damaged = sorted(files)
     before = store.path(damaged).read_bytes()
@@ -238,13 +243,13 @@ def test_a_damaged_file_is_an_error_and_is_never_silently_rendered_again(
     wanted = {s.stream_id: s.geometry.stream_id for row in rows for s in streams_of(row.perturbations).values()}
     for read in (
         lambda: store.stored(rows[0].trajectory_id, wanted, gl.choose().device),
-        lambda: render_plan(rows, config, replayed, frames, nothing_to_do),
+        lambda: render_into(frames, rows, config, replayed, nothing_to_do),
     ):
         with pytest.raises(PipelineError, match=rf"(?s){store.path(damaged).name}: damaged \(.+\).*move the file away"):
             read()
     assert store.path(damaged).read_bytes() == before[:-100]
     store.path(damaged).rename(tmp_path / "moved away")
-    assert render_plan(rows, config, replayed, frames, loop) == files
+    assert render_into(frames, rows, config, replayed, loop) == files
     assert store.path(damaged).read_bytes() == before
 
 
@@ -270,20 +275,20 @@ def test_rendering_that_leaves_the_same_work_undone_is_an_error(
         return []
 
     with pytest.raises(PipelineError, match="still not there"):
-        render_plan(rows[:1], config, replayed, tmp_path, elsewhere)
+        render_into(tmp_path, rows[:1], config, replayed, elsewhere)
 
 
 def test_a_rendering_that_is_given_up_is_dropped_with_its_reason_and_keeps_what_was_there(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
 ) -> None:
-    render_plan(rows, config, replayed, tmp_path / "at_once", given_up)
+    render_into(tmp_path / "at_once", rows, config, replayed, given_up)
     stored = shown_of(FrameStore(tmp_path / "at_once", config.render).rows())
     assert set(outcome.rejections(rows, stored).values()) == {"worker_lost"}
-    render_plan(rows, config, replayed, tmp_path / "at_once", nothing_to_do)
+    render_into(tmp_path / "at_once", rows, config, replayed, nothing_to_do)
 
     twin, lights = rows[:1], without_twins(rows)
-    render_plan(twin, config, replayed, tmp_path / "later", loop)
-    render_plan(rows, config, replayed, tmp_path / "later", given_up)
+    render_into(tmp_path / "later", twin, config, replayed, loop)
+    render_into(tmp_path / "later", rows, config, replayed, given_up)
     stored = shown_of(FrameStore(tmp_path / "later", config.render).rows())
     assert outcome.rejections(rows, stored) == dict.fromkeys((row.episode_id for row in lights), "worker_lost")
     assert len(stored[twin[0].trajectory_id].streams) == 2, "the twin's own frames stay"
@@ -310,8 +315,14 @@ def test_a_refusal_of_a_reserve_that_is_no_longer_needed_is_forgotten(
 ) -> None:
     """As when the refused frames before it are deleted, to be tried again."""
     store = FrameStore(tmp_path, config.render)
-    expected = render_plan(rows, config, replayed, tmp_path, loop)
+    expected = render_into(tmp_path, rows, config, replayed, loop)
     store.keep(())
-    render_plan([replace(rows[2], wanted=True)], config, replayed, tmp_path, given_up)
+    render_plan(
+        [replace(rows[2], wanted=True)],
+        config,
+        TrajectoryStore(replayed),
+        FrameStore(tmp_path, config.render),
+        given_up,
+    )
     assert outcome.rejections(rows, shown_of(store.rows())) == {rows[2].episode_id: "worker_lost"}
-    assert render_plan(rows, config, replayed, tmp_path, loop) == expected
+    assert render_into(tmp_path, rows, config, replayed, loop) == expected

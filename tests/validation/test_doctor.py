@@ -20,7 +20,8 @@ from pipeline.export_config import ExportConfig, LeRobotConfig
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import machine
-from pipeline.run.run import MACHINE, Run
+from pipeline.run.layout import MACHINE
+from pipeline.run.run import Run
 from pipeline.run.work_time import REFERENCE
 from pipeline.stores.sealed_file import seal
 from pipeline.testset import benchmark
