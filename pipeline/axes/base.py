@@ -147,11 +147,17 @@ class Axis(Frozen):
 
     Attributes:
         draws: classes of the perturbations that it samples; the field ``component`` discriminates between them.
+        colour: colour of the axis in plots.
+        dimension: the paper's dimension whose test tasks this axis has; empty if the benchmark tests no such change.
+        audited: part of an unlabelled data set that shows the perturbations of the axis.
         not_held_out: reason why evaluations have no held-out perturbations of this axis; empty if they have some.
         levels: strengths to sample, each with equal probability.
     """
 
     draws: ClassVar[tuple[type[Perturbation], ...]]
+    colour: ClassVar[str] = "#a3384d"
+    dimension: ClassVar[str] = ""
+    audited: ClassVar[Literal["instructions", "cameras", "nothing"]] = "nothing"
     not_held_out: ClassVar[str] = ""
 
     levels: Annotated[tuple[Level, ...], Field(min_length=1)] = LEVELS
@@ -261,10 +267,12 @@ class RenderPerturbation(Perturbation):
         paints: true if it writes textures and nothing else.
         sees_otherwise: true if it shows other surfaces: from another place, through another lens, or behind a
             surface that was opaque.
+        casts_shadows: true if lamps may cast shadows that LIBERO's own do not, which take longer to render.
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
     fields: ClassVar[tuple[str, ...]] = ()
+    casts_shadows: ClassVar[bool]
     paints: ClassVar[bool]
     sees_otherwise: ClassVar[bool]
 
@@ -276,6 +284,7 @@ class RenderPerturbation(Perturbation):
                 f"{cls.__name__} writes {sorted(unsupported)}, which pictures would not follow: make it a "
                 "PhysicsPerturbation, which changes the scene before it is replayed"
             )
+        cls.casts_shadows = "light_castshadow" in cls.fields
         cls.paints = cls.fields == ("tex_data",)
         cls.sees_otherwise = not {*CAMERA_FIELDS, *OPACITY_FIELDS}.isdisjoint(cls.fields)
 

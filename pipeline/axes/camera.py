@@ -266,6 +266,9 @@ class CameraAxis(Axis):
     """
 
     draws: ClassVar = (CameraPerturbation,)
+    colour: ClassVar = "#4285f4"
+    dimension: ClassVar = "camera"
+    audited: ClassVar = "cameras"
 
     distance: DistanceRange | None = DistanceRange()
     spherical: SphericalRange | None = SphericalRange()

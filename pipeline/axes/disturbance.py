@@ -105,6 +105,7 @@ class DisturbanceAxis(Axis):
     """
 
     draws: ClassVar = (DisturbancePerturbation,)
+    colour: ClassVar = "#6b7d94"
 
     impulse_n_s: ByLevel[Annotated[float, Field(gt=0.0, le=100.0)]] = (4.0, 7.0, 10.0, 13.0, 16.0)
     steps: Intervals[Duration] = ((2, 8),)

@@ -78,6 +78,9 @@ class LanguageAxis(Axis):
     """
 
     draws: ClassVar = (LanguagePerturbation,)
+    colour: ClassVar = "#e4572e"
+    dimension: ClassVar = "language"
+    audited: ClassVar = "instructions"
     not_held_out: ClassVar[str] = "its rewrites are a list, and plans train on all of it"
 
     classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)

@@ -115,6 +115,8 @@ class LayoutAxis(Axis):
     """
 
     draws: ClassVar = (LayoutPerturbation,)
+    colour: ClassVar = "#7d9a1f"
+    dimension: ClassVar = "layout"
 
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
     area_m2: float = Field(default=0.12, gt=0.0, le=10.0)

@@ -124,6 +124,8 @@ class NoiseAxis(Axis):
     """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none."""
 
     draws: ClassVar = (NoisePerturbation,)
+    colour: ClassVar = "#9467d6"
+    dimension: ClassVar = "noise"
 
     motion: ByLevel[Motion] = _grid(Motion, radius_px=(7, 11, 17, 23, 33), sigma_px=(2.5, 4.5, 7, 11, 17.5))
     gaussian: ByLevel[Gaussian] = _grid(Gaussian, sigma_px=(1.5, 3.5, 5.5, 7.5, 9.5))

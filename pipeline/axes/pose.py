@@ -357,6 +357,8 @@ class PoseAxis(Axis):
     """
 
     draws: ClassVar = (PosePerturbation, ScenePerturbation)
+    colour: ClassVar = "#d463b0"
+    dimension: ClassVar = "layout"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("scene",)
     step_m: float = Field(default=0.016, ge=0.0001, le=0.2)

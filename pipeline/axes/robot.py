@@ -136,6 +136,8 @@ class RobotAxis(Axis):
     """
 
     draws: ClassVar = (RobotPerturbation,)
+    colour: ClassVar = "#129fc0"
+    dimension: ClassVar = "robot"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = (
         *("controller_posture", "controller_posture", "controller_posture"),

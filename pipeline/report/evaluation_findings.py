@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.axes import level_of_test
+from pipeline.axes import AXES, level_of_test
 from pipeline.evaluation.results import PER_TASK, EpisodeResult, Evaluated
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary, wilson
 from pipeline.grouping import grouped
@@ -111,8 +111,12 @@ def _versions(rows: Sequence[EpisodeResult]) -> dict[str, list[str]]:
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 
-_SAME = ("camera", "robot", "language", "light", "background", "noise")
-COLUMNS: dict[str, tuple[str, ...]] = {**{axis: (axis,) for axis in _SAME}, "layout": ("layout", "pose")}
+DIMENSIONS = ("camera", "robot", "language", "light", "background", "noise", "layout")
+"""The paper's dimensions, in the order of its tables."""
+
+COLUMNS = {
+    dimension: tuple(name for name, axis in AXES.items() if axis.dimension == dimension) for dimension in DIMENSIONS
+}
 """The paper's dimensions to this project's axes."""
 
 NAMES = {("layout", "objects"): "confounding objects", ("pose", "pose"): "displaced targets"}

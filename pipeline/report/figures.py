@@ -25,11 +25,9 @@ Groups = Mapping[str, Values]
 
 REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
-PALETTE = ("#7d9a1f", "#d463b0", "#129fc0", "#6b7d94", "#4285f4", "#e59a00", "#1f9e82", "#9467d6", "#e4572e", "#a3384d")
-"""Colours in the order of ``Axes``; a new axis gets a new colour at its position, so that other axes keep theirs."""
-COLOURS = dict(zip(AXES, PALETTE, strict=False))
+COLOURS = {name: axis.colour for name, axis in AXES.items()}
 OTHER = "#b0794a"
-"""Colour of episodes that are perturbed on several axes, and of axes beyond the number of colours."""
+"""Colour of episodes that are perturbed on several axes."""
 
 INK = "#010203"
 """A colour that nothing else has; the page's text colour replaces it."""

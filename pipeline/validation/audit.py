@@ -82,8 +82,8 @@ class Audit:
     @property
     def unknown(self) -> dict[str, int]:
         """Map each axis to the number of episodes that it may or may not perturb."""
-        counts = Counter({axis: self.unlabelled for axis in AXES if axis != "language"})
-        counts |= {"camera": self.without_camera, "language": self.without_instruction}
+        hidden = {"instructions": self.without_instruction, "cameras": self.without_camera, "nothing": self.unlabelled}
+        counts = Counter({name: hidden[axis.audited] for name, axis in AXES.items()})
         counts.update(self.unplaced)
         return {axis: count for axis, count in counts.items() if count}
 

@@ -71,7 +71,7 @@ def needed_mb(config: Config) -> dict[str, float]:
     export, (episodes, steps) = config.export, _exported(config, amounts)
     # Trajectories, and views of frames and of maps, that planned episodes do not share with their twins.
     trajectories = frames = maps = 0.0
-    for _, number, kinds in _planned(config.plan):
+    for number, kinds in _planned(config.plan):
         physics = any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         trajectories += number * (1 + config.plan.reserve) * physics
         frames += number * len({view for kind in kinds for view in kind.views})
@@ -119,13 +119,13 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in config.render.extras)
     trajectories, rendered_s = amounts.twins, amounts.twin_steps * sum(view_s + maps_s for view_s in frame_s)
     encoded_s = amounts.twin_steps * len(frame_s) * ENCODE_S
-    for axes, episodes, kinds in _planned(config.plan):
+    for episodes, kinds in _planned(config.plan):
         trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         for view, view_s in zip(SCHEMA.views, frame_s, strict=True):
             here = [kind for kind in kinds if view in kind.views]
             rendered = any(issubclass(kind, PhysicsPerturbation | RenderPerturbation) for kind in here)
             mapped = any(_seen_otherwise(kind) for kind in here)
-            shadows_s = SHADOWS_S * SHADOWS * ("light" in axes) * slower
+            shadows_s = SHADOWS_S * SHADOWS * any(_casts_shadows(kind) for kind in kinds) * slower
             rendered_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + maps_s * mapped)
             encoded_s += episodes * amounts.mean_steps * ENCODE_S * bool(here)
     processor = speed.step_s / REFERENCE.step_s
@@ -198,11 +198,14 @@ class Amounts(NamedTuple):
         return self.twin_steps + self.planned * self.mean_steps
 
 
-def _planned(plan: PlanConfig) -> Iterator[tuple[list[str], int, list[type[Perturbation]]]]:
-    """Yield, for each combination, its axes, its wanted number of episodes, and the classes of its perturbations."""
+def _planned(plan: PlanConfig) -> Iterator[tuple[int, list[type[Perturbation]]]]:
+    """Yield, for each combination of axes, its wanted number of episodes, and the classes of its perturbations."""
     for name, episodes in plan.episodes.items():
-        axes = list(axes_of(name))
-        yield axes, episodes, [AXES[axis].draws[0] for axis in axes]
+        yield episodes, [AXES[axis].draws[0] for axis in axes_of(name)]
+
+
+def _casts_shadows(kind: type[Perturbation]) -> bool:
+    return issubclass(kind, RenderPerturbation) and kind.casts_shadows
 
 
 def _seen_otherwise(kind: type[Perturbation]) -> bool:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import IDS, NAME, episode, loop
 
 from pipeline.__main__ import main
+from pipeline.axes import AXES
 from pipeline.axes.camera_pose import AGENT_VIEWS, moved_to
 from pipeline.axes.pose import ROBOT_X_M
 from pipeline.errors import PipelineError
@@ -34,7 +35,7 @@ from pipeline.tables import write_table
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Episode, Floats
-from pipeline.validation.audit import audit
+from pipeline.validation.audit import Audit, audit
 
 TASK = find_task("libero_goal", "put_the_bowl_on_the_plate")
 OWN_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
@@ -123,6 +124,12 @@ def test_what_lost_its_labels_is_known_by_its_instruction_and_by_a_manifest(
     found = audit(edited, test, manifest)
     assert {axis: one.overlaps for axis, one in found.axes.items()} == {"language": 1, "noise": 1}
     assert found.unlabelled == 0
+
+
+def test_episodes_without_labels_hide_all_axes_but_those_that_instructions_and_cameras_show() -> None:
+    result = Audit(9, {}, unlabelled=6, without_camera=2, without_task=0, without_instruction=1, unplaced={})
+    hidden = dict.fromkeys(AXES, 6) | {"camera": 2, "language": 1}
+    assert result.unknown == hidden
 
 
 def test_a_set_of_instructions_alone(test: TestSet, tmp_path: Path) -> None:
