@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib.metadata import version
 from itertools import count
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from packaging.version import Version
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -145,6 +145,11 @@ class LeRobotV21Config(Frozen):
     validation: Share = 0.0
 
 
+Options = RldsConfig | LeRobotConfig | LeRobotV21Config
+"""Options of one format."""
+_OPTIONAL = tuple(kind | None for kind in get_args(Options))
+
+
 class ExportConfig(Frozen):
     """The output formats, and which of the kept episodes they get.
 
@@ -165,14 +170,14 @@ class ExportConfig(Frozen):
     @model_validator(mode="after")
     def _some_format(self) -> ExportConfig:
         if not self.formats:
-            raise ValueError("no format is left, expected one of rlds, lerobot and lerobot_v21")
+            names = [name for name, field in type(self).model_fields.items() if field.annotation in _OPTIONAL]
+            raise ValueError(f"no format is left, expected one of {', '.join(names[:-1])} and {names[-1]}")
         return self
 
     @property
-    def formats(self) -> dict[str, RldsConfig | LeRobotConfig | LeRobotV21Config]:
+    def formats(self) -> dict[str, Options]:
         """Return the options of each requested format, by its name."""
-        formats = {"rlds": self.rlds, "lerobot": self.lerobot, "lerobot_v21": self.lerobot_v21}
-        return {name: options for name, options in formats.items() if options is not None}
+        return {name: options for name, options in self if isinstance(options, Options)}
 
     @property
     def name(self) -> str:

@@ -16,10 +16,8 @@ from pipeline import gl
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import read_json, write, write_json
 from pipeline.formats import exact_statistics, registry
+from pipeline.formats.base import EXPORT
 from pipeline.formats.episodes import by_suite
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
 from pipeline.identity import refuse_unasked
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
@@ -86,7 +84,7 @@ def write_inputs(run: Run) -> None:
 
 def _lost(run: Run) -> dict[str, list[str]]:
     """List the missing records that are no outputs for DVC, by the stage's record: not every run has these datasets."""
-    lost: dict[str, list[str]] = {"rlds": [], "lerobot": []}
+    lost: dict[str, list[str]] = {stage.removeprefix(EXPORT): [] for stage in registry.EXPORT_STAGES}
     for dataset in (*run.formats, *run.failure_formats):
         record = dataset.record_file
         if record != dataset.stage_record and not record.exists():
@@ -187,18 +185,32 @@ def render(run: Run) -> None:
     print(f"{len(rendered)} files of frames are in {run.frames.root}")
 
 
-def export_rlds(run: Run) -> None:
-    """Write the kept episodes as RLDS, a set for each suite, without TensorFlow."""
-    export.export_run(Rlds, run)
-    say_stale("rlds", run)
+def _export(stage: str) -> Stage:
+    """Return the stage that writes the kept episodes in its formats."""
+    kinds = registry.formats_by(stage)
+    records = [f"{kind.name}.json" for kind in kinds]
 
+    def write_datasets(run: Run) -> None:
+        for kind in kinds:
+            # DVC needs the record after which the stage is named, also if the format is not requested.
+            if kind is kinds[0] or kind.name in run.config.export.formats:
+                export.export_run(kind, run)
+        say_stale(stage.removeprefix(EXPORT), run)
 
-def export_lerobot(run: Run) -> None:
-    """Write the kept episodes as a LeRobot v3.0 dataset, and as v2.1 where that is asked for."""
-    export.export_run(LeRobot, run)
-    if run.config.export.lerobot_v21 is not None:
-        export.export_run(LeRobotV21, run)
-    say_stale("lerobot", run)
+    def whole(run: Run) -> bool:
+        """Return whether the finished datasets have all their files, unchanged."""
+        datasets = [dataset for dataset in run.recorded_formats if dataset.stage == stage]
+        return all(export.untouched(dataset) for dataset in datasets)
+
+    write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
+    reads_rewrites = any(kind.rewrites_instructions for kind in kinds)
+    return Stage(
+        write_datasets,
+        ("filter", "export", "plan") if reads_rewrites else ("filter", "export"),
+        (INPUTS, *_OUTCOME) if reads_rewrites else _OUTCOME,
+        (*records, *(f"{registry.FAILURES}/{record}" for record in records)),
+        whole,
+    )
 
 
 def write_manifest(run: Run) -> None:
@@ -307,22 +319,8 @@ def _frames_whole(run: Run) -> bool:
     return run.trajectories.untouched() and run.frames.untouched()
 
 
-def _rlds_whole(run: Run) -> bool:
-    return _datasets_whole(run, "rlds.json")
-
-
-def _lerobot_whole(run: Run) -> bool:
-    return _datasets_whole(run, "lerobot.json")
-
-
-def _datasets_whole(run: Run, stage_record: str) -> bool:
-    """Return whether the finished datasets of one stage have all their files, unchanged."""
-    datasets = [dataset for dataset in run.recorded_formats if dataset.stage_record == run.path(stage_record)]
-    return all(export.untouched(dataset) for dataset in datasets)
-
-
 _OUTCOME = (PLAN, TRAJECTORIES_TABLE, FRAMES_TABLE)
-_RECORDS = ("rlds.json", "lerobot.json", "lerobot_v21.json")
+_RECORDS = tuple(f"{kind.name}.json" for kind in registry.FORMATS)
 _REPORTS = (LEAKAGE, VALIDATION, STATISTICS)
 _EXPORT = ("filter", "export")
 
@@ -345,14 +343,7 @@ STAGES = {
         (TRAJECTORIES_TABLE, FRAMES_TABLE),
         _frames_whole,
     ),
-    "export_rlds": Stage(export_rlds, _EXPORT, _OUTCOME, ("rlds.json", "failures/rlds.json"), _rlds_whole),
-    "export_lerobot": Stage(
-        export_lerobot,
-        (*_EXPORT, "plan"),
-        (INPUTS, *_OUTCOME),
-        ("lerobot.json", "lerobot_v21.json", "failures/lerobot.json", "failures/lerobot_v21.json"),
-        _lerobot_whole,
-    ),
+    **{stage: _export(stage) for stage in registry.EXPORT_STAGES},
     "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
     "recipe": Stage(write_recipe, ("export",), (MANIFEST, "lerobot.json", "lerobot_v21.json"), (FINETUNE,)),

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import pyarrow as pa
 from pydantic import BaseModel
@@ -59,6 +59,26 @@ class Export(Record):
         }
 
 
+EXPORT = "export_"
+"""Beginning of the names of the stages that write formats."""
+
+
+class StepSizes(NamedTuple):
+    """Sizes of the parts of one step of an episode, in KB.
+
+    Attributes:
+        frame_kb: one frame of one view.
+        maps_kb: depth and segmentation of one view, as far as they are stored.
+        poses_kb: object poses, as far as they are stored.
+        motion_kb: state, action and all other columns except the frames.
+    """
+
+    frame_kb: float
+    maps_kb: float
+    poses_kb: float
+    motion_kb: float
+
+
 class Format(ABC, Generic[Options]):
     """A format's dataset of one run.
 
@@ -71,6 +91,12 @@ class Format(ABC, Generic[Options]):
     folder and the record in ``data/<run>``."""
     title: ClassVar[str]
     """Name for people, and the hub's tag."""
+    stage: ClassVar[str]
+    """Stage that writes the format: ``export_<name>``, or the stage of another format."""
+    rewrites_instructions: ClassVar[bool] = False
+    """True if the format can store rewrites of instructions, which depend on the plan's language axis."""
+    step_s: ClassVar[float]
+    """CPU time of one core to write one step of an episode, in s, on the reference machine of ``work_time.py``."""
     columns: ClassVar[tuple[pa.Field, ...]]
     """Columns of the manifest with the place of an episode; null when it was dropped."""
     keys: Mapping[str, str]
@@ -108,9 +134,9 @@ class Format(ABC, Generic[Options]):
     @property
     def stage_record(self) -> Path:
         """Return the record that is an output of the format's stage in DVC."""
-        # One stage writes the kept episodes and the failures.
+        # One stage writes the kept episodes and the failures, of all its formats.
         data = self.data.parent if "outcome" in self.extras else self.data
-        return data / f"{self.name}.json"
+        return data / f"{self.stage.removeprefix(EXPORT)}.json"
 
     @property
     def work(self) -> Path:
@@ -135,6 +161,10 @@ class Format(ABC, Generic[Options]):
             PipelineError: as ``record``.
         """
         return [Written(self.name, self.folder / name, sha256) for name, sha256 in self.record().files.items()]
+
+    @abstractmethod
+    def step_kb(self, sizes: StepSizes) -> float:
+        """Estimate the size of one step of an episode in this format, in KB."""
 
     # Writing: pieces in parallel, each complete or absent, then the files that join them.
 

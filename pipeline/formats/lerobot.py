@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA
 from pipeline.export_config import LeRobotConfig
-from pipeline.formats.base import Format, Row
+from pipeline.formats.base import Format, Row, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
 from pipeline.formats.lerobot_columns import FILE_MB, Convention, camera_column
 from pipeline.formats.read_back import Copy, Fault
@@ -23,6 +23,9 @@ class LeRobot(Format[LeRobotConfig]):
 
     name: ClassVar[Step] = "lerobot"
     title: ClassVar = "LeRobot"
+    stage: ClassVar = "export_lerobot"
+    rewrites_instructions: ClassVar = True
+    step_s: ClassVar = 0.0015
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
@@ -46,6 +49,9 @@ class LeRobot(Format[LeRobotConfig]):
     def root(self) -> Path:
         """Return the folder for ``LeRobotDataset(repo_id, root=root)``."""
         return self.folder / self.options.name
+
+    def step_kb(self, sizes: StepSizes) -> float:
+        return self._convention.step_kb(sizes)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         """Divide the episodes into pieces, each one file of each kind.

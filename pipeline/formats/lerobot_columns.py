@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, MatrixSpec, PosesSpec
+from pipeline.formats.base import StepSizes
 from pipeline.types import Extra
 
 Frames = Literal["video", "images"]
@@ -20,6 +21,12 @@ frame."""
 
 FILE_MB = 200
 """Approximate largest size of a file of data or video."""
+
+VIDEO_KB = 15.0
+"""Size of one step, both views as video, rounded up from ``benchmarks/disk.py``."""
+
+IN_TEXT = 1.2
+"""Size of the base64 columns as a multiple of the PNG files in them."""
 
 LANGUAGE = "language_persistent"
 """lerobot's column of an episode's language annotations, all of them in every frame, from lerobot 0.6 on."""
@@ -70,6 +77,12 @@ class Convention:
     def name(self, column: str) -> str:
         """Return the name of a column of v3.0."""
         return self.names.get(column, column)
+
+    def step_kb(self, sizes: StepSizes) -> float:
+        """Estimate the size of one step of an episode, in KB."""
+        views = len(SCHEMA.views)
+        frames_kb = VIDEO_KB if self.frames == "video" else views * sizes.frame_kb + sizes.motion_kb
+        return frames_kb + IN_TEXT * views * sizes.maps_kb + sizes.poses_kb
 
     def columns(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
         """Describe the columns of every frame, as ``meta/info.json`` does."""

@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from pipeline.episode_schema import GripperSpec
 from pipeline.export_config import LeRobotV21Config
-from pipeline.formats.base import Format, Row
+from pipeline.formats.base import Format, Row, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_columns import CONVENTIONS
@@ -26,6 +26,8 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
     name: ClassVar[Step] = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
+    stage: ClassVar = LeRobot.stage
+    step_s: ClassVar = LeRobot.step_s
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
 
@@ -37,10 +39,8 @@ class LeRobotV21(Format[LeRobotV21Config]):
             self.gripper = GripperSpec(open=1.0, close=0.0)
         self.clients = {"ipec": ("starvla", "gr00t"), "openpi": ("openpi", "openpi_serve")}[options.convention]
 
-    @property
-    def stage_record(self) -> Path:
-        # One stage writes v3.0 and v2.1, because a stage of DVC has files whether or not this format is requested.
-        return super().stage_record.with_name(f"{LeRobot.name}.json")
+    def step_kb(self, sizes: StepSizes) -> float:
+        return self.convention.step_kb(sizes)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []

@@ -20,6 +20,15 @@ FORMATS: tuple[type[Format[Any]], ...] = (
 )
 
 
+EXPORT_STAGES = tuple(dict.fromkeys(kind.stage for kind in FORMATS))
+"""Stages that write formats, in their order."""
+
+
+def formats_by(stage: str) -> list[type[Format[Any]]]:
+    """List the formats that a stage writes; the stage has the name of the first."""
+    return [kind for kind in FORMATS if kind.stage == stage]
+
+
 def formats_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
     """List the requested datasets of a run whose folder is ``data`` and whose episodes have these extras."""
     return [kind(data, options.formats[kind.name], extras) for kind in FORMATS if kind.name in options.formats]

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA
 from pipeline.export_config import RldsConfig
-from pipeline.formats.base import Format, Row
+from pipeline.formats.base import Format, Row, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, dataset_of, shard_path
@@ -25,6 +25,8 @@ class Rlds(Format[RldsConfig]):
 
     name: ClassVar[Step] = "rlds"
     title: ClassVar = "RLDS"
+    stage: ClassVar = "export_rlds"
+    step_s: ClassVar = 0.0004
     columns: ClassVar = (
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
         column("rlds_index", pa.int64(), "place in the shard, null when dropped"),
@@ -35,6 +37,9 @@ class Rlds(Format[RldsConfig]):
         | {"provenance": "episode_metadata"}
     )
     clients = ("openvla_oft",)
+
+    def step_kb(self, sizes: StepSizes) -> float:
+        return len(SCHEMA.views) * (sizes.frame_kb + sizes.maps_kb) + sizes.poses_kb + sizes.motion_kb
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.files import remove
-from pipeline.formats.registry import FAILURES
+from pipeline.formats.base import EXPORT
+from pipeline.formats.registry import EXPORT_STAGES, FAILURES, formats_by
 from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.layout import (
     CARD,
@@ -42,20 +43,20 @@ class Part(NamedTuple):
     made_by: str
 
 
-def _with_failures(*formats: str) -> tuple[str, ...]:
-    """Name the datasets and records of formats that one stage generates, those of failures included."""
+def _datasets(stage: str) -> Part:
+    """Return the datasets and records that a stage writes, those of failures included."""
     names: list[str] = []
-    for dataset in formats:
-        names += [dataset, f"{dataset}.json"]
-    return (*names, *(f"{FAILURES}/{name}" for name in names))
+    for kind in formats_by(stage):
+        names += [kind.name, f"{kind.name}.json"]
+    of_failures = [f"{FAILURES}/{name}" for name in names]
+    return Part((*names, *of_failures), f"{stage}, from the frames")
 
 
 PARTS = {
     "unfinished": Part((WORK,), "nothing: what stopped stages left"),
     "pictures": Part((SHEETS, PREVIEWS, REPORT), "summary and report"),
     "uploads": Part((CARD, FINETUNE), "card and recipe"),
-    "rlds": Part(_with_failures("rlds"), "export_rlds, from the frames"),
-    "lerobot": Part(_with_failures("lerobot", "lerobot_v21"), "export_lerobot, from the frames"),
+    **{stage.removeprefix(EXPORT): _datasets(stage) for stage in EXPORT_STAGES},
     "frames": Part((FRAMES,), "render, from the trajectories: most of a run's time"),
     "trajectories": Part((TRAJECTORIES, REPLAY), "replay, from the demonstrations"),
     "tables": Part(

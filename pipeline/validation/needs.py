@@ -24,6 +24,8 @@ from pipeline.config import Config, DemosConfig, PlanConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN
+from pipeline.formats.base import StepSizes
+from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
@@ -37,10 +39,6 @@ MAP_KB: dict[Extra, float] = {"depth": 31.0, "segmentation": 3.0}
 """A view of one step."""
 POSES_KB, MOTION_KB = 0.7, 0.5
 """One step: object poses; state, action and all other columns except the frames."""
-VIDEO_KB = 15.0
-"""One step in LeRobot, both views as video."""
-IN_TEXT = 1.2
-"""Size of LeRobot's base64 columns as a multiple of the PNG files in them."""
 TRAJECTORY_KB, STATE_KB = 100.0, 1.2
 """A trajectory, and each step of it."""
 EPISODE_KB = 50.0
@@ -55,8 +53,8 @@ SHADOWS_S, SHADOWS = 0.13, 0.4
 """Time that shadows add to a frame, and the share of the light episodes that have them."""
 MAPS_S = 0.045
 """Depth, segmentation, or both, of a view of one step: a second rendering, and PNG files."""
-RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.0015, 0.0006
-"""A step of an episode in the exports and in ``validate``."""
+VALIDATE_S = 0.0006
+"""A step of an episode in ``validate``."""
 FIXED_S = 100.0
 """Wall-clock time of starting the stages, previews, sheets and report, with any number of workers."""
 IN_TURN = ("rest", "GPU")
@@ -68,7 +66,7 @@ def needed_mb(config: Config) -> dict[str, float]:
     """Estimate the megabytes that each folder of a run takes."""
     amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
     twins, _, twin_steps, mean_steps = amounts
-    export, (episodes, steps) = config.export, _exported(config, amounts)
+    episodes, steps = _exported(config, amounts)
     # Trajectories, and views of frames and of maps, that planned episodes do not share with their twins.
     trajectories = frames = maps = 0.0
     for number, kinds in _planned(config.plan):
@@ -80,22 +78,15 @@ def needed_mb(config: Config) -> dict[str, float]:
     map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
     poses_kb = POSES_KB if "object_poses" in extras else 0.0
 
-    def lerobot_kb(video: bool) -> float:
-        step_kb = VIDEO_KB if video else views * frame_kb + MOTION_KB
-        return steps * (step_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
-
     needed_kb = {
         "trajectories": (twins + trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
         "frames": (views * twin_steps + frames * mean_steps) * frame_kb
         + (views * twin_steps + maps * mean_steps) * map_kb
         + amounts.steps * (poses_kb + MOTION_KB),
     }
-    if export.rlds is not None:
-        needed_kb["rlds"] = steps * (views * (frame_kb + map_kb) + poses_kb + MOTION_KB) + episodes * EPISODE_KB
-    if export.lerobot is not None:
-        needed_kb["lerobot"] = lerobot_kb(export.lerobot.frames == "video")
-    if export.lerobot_v21 is not None:
-        needed_kb["lerobot_v21"] = lerobot_kb(export.lerobot_v21.convention == "ipec")
+    sizes = StepSizes(frame_kb, map_kb, poses_kb, MOTION_KB)
+    for dataset in formats_of(config.data, config.export, extras):
+        needed_kb[dataset.name] = steps * dataset.step_kb(sizes) + episodes * EPISODE_KB
     return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
 
 
@@ -129,13 +120,13 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
             rendered_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + maps_s * mapped)
             encoded_s += episodes * amounts.mean_steps * ENCODE_S * bool(here)
     processor = speed.step_s / REFERENCE.step_s
-    formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
+    datasets = formats_of(config.data, config.export, config.render.extras)
     _, exported_steps = _exported(config, amounts)
     return {
         "replay": trajectories * replay_s(amounts.mean_steps, speed),
         "render": encoded_s + rendered_s * (not speed.gpus),
-        "export": processor * exported_steps * sum(formats[name] for name in config.export.formats),
-        "validate": processor * exported_steps * VALIDATE_S * len(config.export.formats),
+        "export": processor * exported_steps * sum(dataset.step_s for dataset in datasets),
+        "validate": processor * exported_steps * VALIDATE_S * len(datasets),
         "rest": processor * FIXED_S,
     } | ({"GPU": rendered_s / speed.gpus} if speed.gpus else {})
 
