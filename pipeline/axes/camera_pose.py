@@ -4,20 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.axes.camera import ORBIT_CENTRE_M, PARAMETERS, CameraPerturbation
-from pipeline.libero.bddl import Arena
+from pipeline.libero.arenas import ARENAS, Arena
 from pipeline.types import Floats
-
-_TURN_WXYZ = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
-_LOW_TURN_WXYZ = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
-AGENT_VIEWS: dict[Arena, tuple[tuple[float, float, float], tuple[float, float, float, float]]] = {
-    "tabletop": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
-    "kitchen": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
-    "study": ((0.4586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
-    "floor": ((0.8965773716836134, 0.0, 0.65), _LOW_TURN_WXYZ),
-    "living_room": ((0.6065773716836134, 0.0, 0.96), _LOW_TURN_WXYZ),
-}
-"""Position (m) and orientation of LIBERO's agent view in the world, by arena (``_setup_camera`` of LIBERO's
-problems)."""
 
 UNMOVED = 0.05
 """Angle in degrees below which a camera counts as LIBERO's own. Matrices are stored in single precision."""
@@ -32,7 +20,7 @@ def moved_to(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
         extrinsics: (4, 4) from the camera (z forward, y down) to the world.
         arena: arena whose nominal agent view the pose is compared with.
     """
-    position_m, quat_wxyz = AGENT_VIEWS[arena]
+    position_m, quat_wxyz = ARENAS[arena].camera_m, ARENAS[arena].camera_quat_wxyz
     offset_m, nominal_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, np.array(position_m) - ORBIT_CENTRE_M
     radius_m, nominal_radius_m = np.linalg.norm(offset_m), np.linalg.norm(nominal_offset_m)
     azimuth = np.arctan2(offset_m[1], offset_m[0])

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from pipeline.axes.base import Axis, Frozen, Level, Perturbation, PhysicsPerturbation, pick, point
 from pipeline.libero import bddl
-from pipeline.libero.bddl import Arena
+from pipeline.libero.arenas import ARENAS
 from pipeline.libero.task_goal import relation_holds
 from pipeline.libero.tasks import Same, find_task
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -36,15 +36,6 @@ Tasks that LIBERO-Plus leaves out, LIBERO-90's and the user's own, have the disk
 
 BASE_M = {"akita_black_bowl_1": (0.35, 0.05), "cream_cheese_1": (0.15, 0.10), "wine_bottle_1": (0.0, 0.05)}
 """Displacement of things in the goal suite from LIBERO's own places, which LIBERO-Plus applies before its disks."""
-
-ROBOT_X_M: dict[Arena, float] = {
-    "tabletop": -0.66,
-    "kitchen": -0.66,
-    "study": -0.55,
-    "living_room": -0.51,
-    "floor": -0.6,
-}
-"""Position of the robot's base along x, by arena, in the frame of the working surface."""
 
 REACH_M = 0.82
 """Reach of the hand, pointing down, from its base at the height of a table; the replay shows if it grasps there.
@@ -340,7 +331,7 @@ def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
     definition = bddl.read(task.bddl_file)
     if thing not in definition.objects or thing not in definition.of_interest:
         return True
-    robot_m = (ROBOT_X_M[definition.arena], 0.0)
+    robot_m = (ARENAS[definition.arena].robot_x_m, 0.0)
     return math.dist(place_m, robot_m) <= max(REACH_M, math.dist(definition.centres_m[thing], robot_m))
 
 

@@ -6,17 +6,15 @@ from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 from bddl.parsing import scan_tokens
 
 from pipeline.errors import PipelineError
+from pipeline.libero.arenas import Arena
 
 Fact = tuple[str, ...]
 """A predicate and its arguments, such as ``("on", "plate_1", "main_table_plate_region")``."""
-
-Arena = Literal["tabletop", "kitchen", "living_room", "study", "floor"]
-"""LIBERO's rooms, which differ in table or floor, walls, lamps and the place of the agent view."""
 
 _ARENA = re.compile(rf"libero_({'|'.join(get_args(Arena))})(?:_tabletop)?_manipulation")
 _PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")

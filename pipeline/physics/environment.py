@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
+from pipeline.libero.arenas import SURFACES
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import fixed_pose, physics_to_read
-from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Push, Scene, Task
 
 DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])

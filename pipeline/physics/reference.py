@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pipeline.libero.arenas import SURFACES
 from pipeline.scenes.compiled import CompiledScene, fixed_pose
-from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Scene
 
 Mask = NDArray[np.bool_]

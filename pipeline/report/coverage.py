@@ -18,14 +18,12 @@ from pipeline.axes.noise import NoisePerturbation
 from pipeline.axes.pose import PosePerturbation, ScenePerturbation, displacements
 from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
 from pipeline.libero import bddl
+from pipeline.libero.arenas import ARENAS
 from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
 from pipeline.report.figures import Panel, bars, histogram, scatter, strips
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
-
-STUDY_TABLE_M = np.array([-0.2, 0.0])
-"""Position of the study's table; all other arenas' surfaces are centred (LIBERO's ``study_table_offset``)."""
 
 
 class Draw(NamedTuple):
@@ -189,9 +187,9 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
         tested_at += [pair.split(",") for pair in str(parameters["positions"]).split(";") if pair]
     placed_at = []
     for draw in draws:
-        centre = STUDY_TABLE_M if bddl.read(draw.task.bddl_file).arena == "study" else np.zeros(2)
+        room = ARENAS[bddl.read(draw.task.bddl_file).arena]
         placed = draw.resolved["objects"] if draw.resolved else ()
-        placed_at += [np.array(thing["position_m"][:2]) - centre for thing in placed]
+        placed_at += [np.array(thing["position_m"][:2]) - [room.surface_x_m, 0.0] for thing in placed]
     categories = {added.category for draw in draws for added in draw.made.objects}
     groups = {"benchmark": np.unique(np.array(tested_at, float).reshape(-1, 2), axis=0), "layout": np.array(placed_at)}
     tested_counts = [float(parameters["count"]) for parameters in tested]

@@ -12,7 +12,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import mujoco
 import numpy as np
@@ -31,27 +31,18 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import decode
 from pipeline.libero import bddl
+from pipeline.libero.arenas import ARENAS, SURFACES, Arena
 from pipeline.libero.tasks import find_task
 from pipeline.planning.plan import Row
 from pipeline.run import outcome
 from pipeline.run.finished import SEEN
 from pipeline.run.run import Run
 from pipeline.scenes.compiled import physics_to_read
-from pipeline.scenes.swept_path import SURFACES
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats
 
 CAMERA_SIDE_M = 0.19
 """Least x, in the frame of the working surface, at which an object stands on the side of the agent camera."""
-
-CAMERA_M: dict[str, tuple[float, float]] = {
-    "tabletop": (0.66, 0.71),
-    "kitchen": (0.66, 0.71),
-    "study": (0.66, 0.74),
-    "floor": (0.90, 0.65),
-    "living_room": (0.61, 0.55),
-}
-"""Position of LIBERO's agent camera, by arena: along x in the frame of the working surface, and above it."""
 
 SAMPLE = 200
 """Largest number of kept episodes of each axis that are measured: a new scene takes a third of a second."""
@@ -251,7 +242,7 @@ def _of_test(tested: TestTask) -> Iterator[tuple[str, float]]:
             yield from _targets_moved(tested.suite, tested.base, moves, int(parameters["level"]))
         case "layout":
             xy_m = np.array([pair.split(",") for pair in str(parameters["positions"]).split(";")], float)
-            yield from _added(str(parameters["category"]).split(","), xy_m, str(parameters["arena"]))
+            yield from _added(str(parameters["category"]).split(","), xy_m, cast(Arena, parameters["arena"]))
         case "language":
             yield "language: words", len(str(parameters["text"]).split())
 
@@ -294,13 +285,13 @@ def _to_nearest(test: TestSet, places: Places) -> Iterator[tuple[str, float]]:
                 yield f"pose: test's thing of interest in {tested.suite} to the nearest other (cm)", 100 * min(apart_m)
 
 
-def _added(models: Sequence[str], xy_m: Floats, arena: str) -> Iterator[tuple[str, float]]:
+def _added(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:
     """Measure a scene with added objects, by their models and their positions (N, 2) in the frame of the surface."""
     for number in range(1, 6):
         yield f"layout: scenes with {number} added", len(models) == number
     if len(models) > 1:
         yield f"layout: scenes with {len(models)} added that repeat a model", len(set(models)) < len(models)
-    x_m, z_m = CAMERA_M[arena]
+    x_m, z_m = ARENAS[arena].camera_xz_m
     for place in xy_m:
         yield "layout: object on the camera's side", bool(place[0] > CAMERA_SIDE_M)
         yield "layout: object to camera (m)", float(np.hypot(np.linalg.norm(place - [x_m, 0.0]), z_m))

@@ -1,23 +1,15 @@
 """Time that finished trajectories and frames took, or would take: measured figures, scaled to a machine's speed.
 
-Times are CPU times of one core of the machine that ``REFERENCE`` describes. Times of frames are 0.8 of the results of
-``benchmarks/frame_cost.py`` on a busy machine, so that they sum up to the stage of ``configs/starter.yaml``.
+Times are CPU times of one core of the machine that ``REFERENCE`` describes. The times of frames are in
+``libero/arenas.py``.
 """
 
-from pipeline.libero.bddl import Arena
+from pipeline.libero.arenas import ARENAS
 from pipeline.run.machine import Speed
 
 REFERENCE = Speed(step_s=0.0033, frame_s=0.093)
 """Speed of the machine of the figures below, by ``machine.trial``: one repeated step, and a frame without savings."""
 
-FRAME_S: dict[Arena, tuple[float, float]] = {
-    "tabletop": (0.032, 0.041),
-    "floor": (0.022, 0.034),
-    "kitchen": (0.041, 0.033),
-    "living_room": (0.024, 0.047),
-    "study": (0.028, 0.035),
-}
-"""Times in s for a frame of the agent view and of the wrist view, with savings."""
 ENCODE_S = 0.004
 """Time for a frame's JPEG, and its noise if it has some. A GPU does not make it quicker."""
 SCENE_S, STEP_S, TRIES = 2.2, 0.007, 1.4
@@ -35,6 +27,6 @@ def frame_s(speed: Speed) -> float:
     if speed.gpus:
         return speed.frame_s / speed.gpus + ENCODE_S
     views_s: list[float] = []
-    for views in FRAME_S.values():
-        views_s += views
+    for arena in ARENAS.values():
+        views_s += arena.frame_s
     return speed.frame_s / REFERENCE.frame_s * sum(views_s) / len(views_s) + ENCODE_S

@@ -13,10 +13,10 @@ from pipeline import seeding
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
+from pipeline.libero.arenas import ARENAS
 from pipeline.libero.bddl import Bddl
 from pipeline.scenes.agent_view import AgentView
 from pipeline.scenes.compiled import CompiledScene, physics_to_read, simulate_held
-from pipeline.scenes.regions import REGIONS
 from pipeline.scenes.swept_path import SweptPath
 from pipeline.types import Demo, Floats, RollOut, Scene, State
 
@@ -128,7 +128,7 @@ class _Placement:
         self._added = [model.body(name).id for name in names]
         path = np.stack([State.of(state, self._old_nq).qpos for state in states])
         self._swept = SweptPath(model, np.isin(model.geom_bodyid, self._added), path)
-        self._regions = REGIONS[definition.arena]
+        self._regions = ARENAS[definition.arena].regions
         self._view = AgentView(model, self._scene.data)
         things = [int(model.body(f"{thing}_main").rootid[0]) for thing in definition.things_of_interest]
         self._things_px = [pixels for pixels in self._view.pixels_of(things) if len(pixels)]

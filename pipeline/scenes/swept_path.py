@@ -6,10 +6,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.libero.arenas import SURFACES
 from pipeline.types import Floats
 
-SURFACES = ("table", "study_table", "living_room_table", "floor")
-"""Bodies of LIBERO's arenas that objects stand on; the first body that an arena has is its working surface."""
 _RAY_GROUP = 5
 
 

@@ -20,7 +20,7 @@ import tensorflow_datasets as tfds
 
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
-from pipeline.axes.camera_pose import AGENT_VIEWS, moved_to
+from pipeline.axes.camera_pose import moved_to
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
@@ -28,6 +28,7 @@ from pipeline.errors import PipelineError
 from pipeline.formats.lerobot_columns import EPISODE_ID, camera_column
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.libero import bddl
+from pipeline.libero.arenas import ARENAS
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.planning.leakage import AxisDistance, Compared
 from pipeline.planning.leakage import check as compare
@@ -212,7 +213,7 @@ def _row(episode: Found, task: Task | None, test: TestSet) -> Compared:
     perturbations = [p for p in _labels(episode) if task is not None or not _needs_task(p)]
     if episode.extrinsics is not None:
         perturbations = [p for p in perturbations if p.axis != "camera"]
-        arenas = list(AGENT_VIEWS) if task is None else [bddl.read(task.bddl_file).arena]
+        arenas = list(ARENAS) if task is None else [bddl.read(task.bddl_file).arena]
         cameras = [moved_to(episode.extrinsics, arena) for arena in arenas]
         if None not in cameras:
             anywhere = tasks(TESTED_SUITES[0])[0]

@@ -27,10 +27,11 @@ from pipeline.export_config import CLEAN
 from pipeline.formats.base import StepSizes
 from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
+from pipeline.libero.arenas import ARENAS
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.run.machine import Speed
-from pipeline.run.work_time import ENCODE_S, FRAME_S, REFERENCE, replay_s
+from pipeline.run.work_time import ENCODE_S, REFERENCE, replay_s
 from pipeline.types import Extra, Task
 
 JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
@@ -104,7 +105,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     amounts = Amounts.of(tasks, config.plan)
     # Time to render a frame of each view: the mean over all demonstrations.
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
-    drawn_s = np.average([FRAME_S[arena] for arena in arenas], axis=0, weights=weights)
+    drawn_s = np.average([ARENAS[arena].frame_s for arena in arenas], axis=0, weights=weights)
     slower = speed.frame_s / REFERENCE.frame_s
     frame_s = [speed.frame_s] * len(drawn_s) if speed.gpus else [float(s) * slower for s in drawn_s]
     maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in config.render.extras)

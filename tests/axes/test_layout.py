@@ -16,7 +16,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.objects import TEST_CATEGORIES, goes_with, models, taken
 from pipeline.config import ReplayConfig
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.libero.bddl import Arena
+from pipeline.libero.arenas import ARENAS, Arena, Region
 from pipeline.libero.starts import HOME_RAD, recorded_start
 from pipeline.libero.tasks import tasks
 from pipeline.physics.environment import Environment
@@ -25,7 +25,6 @@ from pipeline.physics.replay import replay, roll_out
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import Sight
 from pipeline.scenes.placement import CLEARANCE_M, HIDDEN, SEEN_PX, enough_seen, place
-from pipeline.scenes.regions import REGIONS, Region
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Scene, Task
@@ -108,7 +107,8 @@ def test_a_model_comes_twice_as_often_as_in_the_test_set() -> None:
 def test_regions_are_those_of_the_test_set() -> None:
     """Of the objects that it adds to an arena, 95 % stand in the regions, and as many of them in front."""
     world_m = {"study": -0.2}
-    for arena, known in REGIONS.items():
+    for arena, room in ARENAS.items():
+        known = room.regions
         places: Counter[tuple[float, float]] = Counter()
         for test in benchmark.load(REPOSITORY / benchmark.FOLDER).of("layout"):
             if test.parameters["arena"] == arena:
@@ -133,7 +133,7 @@ def test_places_are_on_the_cameras_side_as_often_as_the_test_s(arena: Arena) -> 
     drawn = []
     for key in range(1000):
         keyed = seeding.rng("side", arena, key)
-        first, _ = REGIONS[arena].order(keyed)
+        first, _ = ARENAS[arena].regions.order(keyed)
         drawn.append(first.draw(keyed)[0])
     assert np.mean(np.array(drawn) > 0.19) == pytest.approx(np.mean(np.array(tested) > 0.19), abs=0.13)
 
@@ -228,7 +228,7 @@ def test_objects_touch_the_table_only_and_the_demonstration_passes_them_by(
 
 
 def test_objects_stand_in_the_regions_of_the_arena(changed: Scene) -> None:
-    known = REGIONS["tabletop"]
+    known = ARENAS["tabletop"].regions
     for placed in changed.resolved["layout"]["objects"]:
         assert within(known.front, placed["position_m"][:2]) or within(known.back, placed["position_m"][:2])
 

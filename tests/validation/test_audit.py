@@ -19,17 +19,15 @@ from synthetic import IDS, NAME, episode, loop
 
 from pipeline.__main__ import main
 from pipeline.axes import AXES
-from pipeline.axes.camera_pose import AGENT_VIEWS, moved_to
-from pipeline.axes.pose import ROBOT_X_M
+from pipeline.axes.camera_pose import moved_to
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
-from pipeline.libero.bddl import Arena
+from pipeline.libero.arenas import ARENAS, Arena
 from pipeline.libero.tasks import find_task
-from pipeline.report.seen import CAMERA_M
 from pipeline.run.export import export
 from pipeline.tables import write_table
 from pipeline.testset import benchmark
@@ -184,15 +182,15 @@ def test_the_agent_views_are_liberos(arena: Arena) -> None:
                 self.pose = pos, quat
 
     name = arena if arena in ("tabletop", "floor") else f"{arena}_tabletop"
-    recorder = Recorder()
+    recorder, room = Recorder(), ARENAS[arena]
     TASK_MAPPING[f"libero_{name}_manipulation"]._setup_camera(None, recorder)
-    for ours, liberos in zip(AGENT_VIEWS[arena], recorder.pose, strict=True):
+    for ours, liberos in zip((room.camera_m, room.camera_quat_wxyz), recorder.pose, strict=True):
         np.testing.assert_allclose(ours, liberos, atol=1e-6)
 
 
 @pytest.mark.parametrize("arena", get_args(Arena))
 def test_a_pose_is_read_back_as_the_change_that_made_it(arena: Arena) -> None:
-    own_m, own_wxyz = AGENT_VIEWS[arena]
+    own_m, own_wxyz = ARENAS[arena].camera_m, ARENAS[arena].camera_quat_wxyz
     own = Rotation.from_quat(np.roll(own_wxyz, -1))
     rng = np.random.default_rng(5)
     for azimuth, elevation, yaw, pitch in rng.uniform(-25, 25, (20, 4)):
@@ -222,6 +220,6 @@ def test_a_folder_without_a_dataset_is_refused(tmp_path: Path, test: TestSet) ->
         audit(tmp_path, test)
 
 
-@pytest.mark.parametrize("places", [AGENT_VIEWS, CAMERA_M, ROBOT_X_M, arenas.TASKS])
+@pytest.mark.parametrize("places", [ARENAS, arenas.TASKS])
 def test_what_is_known_of_arenas_is_known_of_all(places: Mapping[str, object]) -> None:
     assert places.keys() == set(get_args(Arena))
