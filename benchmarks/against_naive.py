@@ -49,7 +49,9 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         trajectories, frames = Path(temporary) / "trajectories", Path(temporary) / "frames"
         begun = time.process_time()
-        verdicts = Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop, config.filter).of(rows)
+        verdicts = Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop, config.filter).complete(
+            rows
+        )
         replayed = time.process_time()
         render_plan(rows, config, TrajectoryStore(trajectories), FrameStore(frames, config.render), loop)
         rendered = time.process_time()

@@ -49,7 +49,7 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         root = Path(temporary)
         trajectories = root / "trajectories"
-        Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop, config.filter).of(rows)
+        Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop, config.filter).complete(rows)
 
         def rendered(run: Workers, name: str) -> float:
             start = time.perf_counter()

@@ -73,7 +73,7 @@ def main() -> None:
         runner(ComputeConfig(workers=arguments.workers), Path("data")) as run,
     ):
         store = TrajectoryStore(arguments.folder or Path(temporary))
-        Replays(demos, REPLAY, store, run).of(list(rows.values()))
+        Replays(demos, REPLAY, store, run).complete(list(rows.values()))
         replayed = store.rows()
         lines = _lines(rows.values(), replayed)
         shapes = list(_shapes(rows.values(), replayed, store))

@@ -14,5 +14,5 @@ def replayed_twin(config: Config, task: str, folder: Path) -> Trajectory:
     """Replay a task's first demonstration unperturbed; ``folder`` stores it under its trajectory's id."""
     demos = config.demos.model_copy(update={"tasks": (task,)})
     twin = plan.twins(demos.index().entries, config.plan.seed, config.replay)[0]
-    Replays(demos, config.replay, TrajectoryStore(folder), loop).of([twin])
+    Replays(demos, config.replay, TrajectoryStore(folder), loop).complete([twin])
     return TrajectoryStore(folder).load(twin.trajectory_id)

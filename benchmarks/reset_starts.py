@@ -46,7 +46,7 @@ def main() -> None:
     planned = {entry.task: plan.resets([entry], arguments.starts, 0.0, SEED, REPLAY) for entry in demos.index().entries}
     store = TrajectoryStore(arguments.folder)
     with runner(ComputeConfig(workers=arguments.workers), Path("data")) as run:
-        Replays(demos, REPLAY, store, run).of([*chain.from_iterable(planned.values())])
+        Replays(demos, REPLAY, store, run).complete([*chain.from_iterable(planned.values())])
     yields, ours, libero = {}, [], []
     for task, rows in planned.items():
         human, *replays = [store.load(row.trajectory_id) for row in rows]

@@ -125,7 +125,7 @@ class PlanConfig(Frozen):
 
     @model_validator(mode="after")
     def _axes_match_episodes(self) -> PlanConfig:
-        in_axes = {*self.axes.drawn()}
+        in_axes = {*self.axes.configured()}
         in_episodes: set[str] = set()
         for name in self.episodes:
             in_episodes.update(axes_of(name))
@@ -133,17 +133,17 @@ class PlanConfig(Frozen):
             section, lacking = ("axes", "episodes") if axis in in_axes else ("episodes", "axes")
             raise ValueError(f"axes and episodes must name the same axes: {axis} is in {section}, but not in {lacking}")
         for name in self.episodes:
-            self.drawn_from(name)
+            self.axes_for(name)
         return self
 
-    def drawn_from(self, name: str) -> tuple[Axis, ...]:
+    def axes_for(self, name: str) -> tuple[Axis, ...]:
         """Return the axes that the episodes called ``name`` sample from.
 
         Raises:
             ValueError: as ``Axis.beside``.
         """
         axes = axes_of(name)
-        return tuple(self.axes.drawn()[axis].beside(axes) for axis in axes)
+        return tuple(self.axes.configured()[axis].beside(axes) for axis in axes)
 
 
 class ReplayConfig(Frozen):
@@ -283,7 +283,7 @@ class Config(Frozen):
                     "out, leave them out of demos.tasks, or name a bank that has some (the command rewrite makes one)"
                 )
         components = {CLEAN}
-        for axis in axes.drawn():
+        for axis in axes.configured():
             components.update(components_of(axis))
         values_of_run = {
             "axis": {CLEAN, *self.plan.episodes},

@@ -13,8 +13,8 @@ def perform_stage(name: str) -> None:
     ensure_fixed_machine_code()
     from pipeline.exit_status import exit_status
     from pipeline.identity import REMAKE
+    from pipeline.run.claim import claimed, locked, refuse_other_folder
     from pipeline.run.run import Run
-    from pipeline.run.stage import claimed, locked, refuse_other_folder
     from pipeline.stages import STAGES, perform
 
     parser = argparse.ArgumentParser(description=f"Stage {name}: {STAGES[name].work.__doc__}")

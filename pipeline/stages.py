@@ -21,6 +21,7 @@ from pipeline.formats.episodes import by_suite
 from pipeline.identity import refuse_unasked
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
+from pipeline.run.claim import claimed, locked
 from pipeline.run.cleaning import say_stale
 from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
 from pipeline.run.foreign import refuse_foreign_files
@@ -44,7 +45,6 @@ from pipeline.run.outcome import outdated, rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.run.run import Run
-from pipeline.run.stage import claimed, locked
 from pipeline.stores.frame_store import shown_of
 from pipeline.testset import benchmark
 
@@ -116,9 +116,9 @@ def doctor(run: Run) -> None:
 
 
 def make_plan(run: Run) -> None:
-    """Sample every perturbation of the run and write the plan, one row for each wanted episode."""
+    """Sample every perturbation of the run and write the plan, one row for each wanted episode and each reserve."""
     rows = plan_stage.make(run.config)
-    dropped.refuse_unasked(rows, run)
+    dropped.refuse_deletion(rows, run)
     for axis, number in plan.shortage(rows, run.config.plan).items():
         print(
             f"{axis}: {number} of {run.config.plan.episodes[axis]} wanted episodes cannot be planned, as no more "
@@ -143,10 +143,10 @@ def replay(run: Run) -> None:
     rows, config = run.plan, run.config
     plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
-    dropped.refuse_unasked(rows, run)
+    dropped.refuse_deletion(rows, run)
     with run.workers() as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
-        verdicts = replays.of(rows)
+        verdicts = replays.complete(rows)
     # Keep the reserves too that the stage `render` replayed because frames were rejected.
     run.trajectories.keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
@@ -163,19 +163,20 @@ def render(run: Run) -> None:
     rows, config = run.plan, run.config
     plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
-    dropped.refuse_unasked(rows, run)
+    dropped.refuse_deletion(rows, run)
     # The configuration may have changed since the plan was made.
     config.export.refuse_too_few(plan.demonstrations(rows))
     replayed = int(read_json(run.path(REPLAY))["replayed"])
     with run.workers(renders=True) as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
         rejected: dict[str, str] | None = None
+        # `render_plan` renders reserves that are replayed already. This loop replays those that are not.
         while True:
             rejected_now = rejections(rows, shown_of(run.frames.rows()))
             if rejected_now == rejected:
                 break
             rejected = rejected_now
-            verdicts = replays.of(rows, rejected)
+            verdicts = replays.complete(rows, rejected)
             rendered = render_plan(rows, config, run.trajectories, run.frames, workers)
             run.frames.keep(rendered)
     run.trajectories.keep(verdicts)
@@ -382,10 +383,13 @@ def perform(name: str, run: Run, title: str = "") -> None:
     stage = STAGES[name]
     memory = _memory(name, run)
     whole = stage.whole is None or stage.whole(run)
-    if whole and memory is not None and memory.holds():
+    reason = None if memory is None else memory.why_not()
+    if whole and memory is not None and reason is None:
         print(f"{title or name}: up to date", flush=True)
         return
     print(title or name, flush=True)
+    if reason not in (None, finished.NO_RECORD):
+        print(f"  changed since the last call: {reason}", flush=True)
     refuse_foreign_files(run.folder)
     stage.work(run)
     after = _memory(name, Run(run.config))

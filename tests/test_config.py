@@ -279,7 +279,7 @@ def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest
     plan = f"plan: {{episodes: {{language: 1, background: 1}}, axes: {axes}}}"
     file.write_text(f"name: mine\ndemos: {{root: ~/d}}\nfolder: ~/runs\n{plan}")
     config = load(file)
-    language, background = (config.plan.axes.drawn()[axis] for axis in ("language", "background"))
+    language, background = (config.plan.axes.configured()[axis] for axis in ("language", "background"))
     assert isinstance(language, LanguageAxis)
     assert isinstance(background, BackgroundAxis)
     (source,) = background.sources

@@ -78,7 +78,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
         rejected: dict[str, str] | None = None
         while (rejected_now := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = rejected_now
-            Replays(run.demos, run.replay, trajectories, workers, run.filter).of(rows, rejected)
+            Replays(run.demos, run.replay, trajectories, workers, run.filter).complete(rows, rejected)
             outcome = selection.select(chosen, verdicts_of(trajectories.rows(), chosen, run.filter), rejected)
             kept = [row for row in chosen if outcome[row.episode_id].kept]
             if len(kept) < experiment.episodes:
@@ -114,7 +114,7 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
     wanted, rows, begin = experiment.run.plan, [], 0
     for name in experiment.arms[arm]:
         end = begin + wanted.episodes[name] // len(by_task)
-        axes = wanted.axes.model_copy(update=dict.fromkeys(wanted.axes.drawn().keys() - axes_of(name)))
+        axes = wanted.axes.model_copy(update=dict.fromkeys(wanted.axes.configured().keys() - axes_of(name)))
         config = PlanConfig(seed=wanted.seed, axes=axes, episodes={name: wanted.episodes[name]}, reserve=wanted.reserve)
         group: list[DemoEntry] = []
         for task in experiment.tasks:

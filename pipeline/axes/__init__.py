@@ -44,7 +44,7 @@ class Axes(Frozen):
     noise: NoiseAxis | None = None
     language: LanguageAxis | None = None
 
-    def drawn(self) -> dict[str, Axis]:
+    def configured(self) -> dict[str, Axis]:
         """Return the configured axes by name."""
         return {name: axis for name, axis in self if axis is not None}
 

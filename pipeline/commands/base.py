@@ -165,15 +165,15 @@ def owned(arguments: argparse.Namespace) -> Run:
     """Open the run that a command reads.
 
     Raises:
-        PipelineError: as ``run.stage.owned``.
+        PipelineError: as ``run.claim.owned``.
     """
-    from pipeline.run import stage
+    from pipeline.run import claim
 
-    return stage.owned(config_file(arguments))
+    return claim.owned(config_file(arguments))
 
 
 def plan_of(text: str) -> Path:
     """Parse an argument that names a configuration, and return the file of its run's plan."""
-    from pipeline.run import stage
+    from pipeline.run import claim
 
-    return stage.owned(Path(text)).plan_file
+    return claim.owned(Path(text)).plan_file

@@ -116,7 +116,7 @@ def sources(arguments: argparse.Namespace) -> None:
     """
     from pipeline.axes import AXES
 
-    axes_of_run = loaded(arguments).plan.axes.drawn()
+    axes_of_run = loaded(arguments).plan.axes.configured()
     numbers: dict[str, int] = {}
     for name, axis in AXES.items():
         numbers.update((axes_of_run.get(name) or axis()).offered())

@@ -91,10 +91,10 @@ def clean(arguments: argparse.Namespace) -> None:
     run has marked, and a file that no stage made inside a folder to delete, are errors.
     """
     from pipeline.generated import edits_in_words
-    from pipeline.run import cleaning, foreign, stage
+    from pipeline.run import claim, cleaning, foreign
 
     run = owned(arguments)
-    stage.refuse_unmarked(run.folder)
+    claim.refuse_unmarked(run.folder)
     size_of_part = cleaning.found(run, arguments.only or tuple(cleaning.PARTS))
     if not size_of_part:
         print(f"{run.folder} has nothing of this")

@@ -33,7 +33,7 @@ def write_shard(path: Path, episode_ids: Sequence[str], load: Load, extras: tupl
         for episode_id in episode_ids:
             episode = load(episode_id)
             check(episode, extras)
-            encoded = features(extras).encode_example(_tree(episode))
+            encoded = features(extras).encode_example(_nested_example(episode))
             example = _serializer(extras).get_tf_example(encoded)
             # protobuf otherwise orders its map differently in every process.
             file.write(framed(example.SerializeToString(deterministic=True)))
@@ -144,7 +144,8 @@ def _serializer(extras: tuple[Extra, ...] = ()) -> Any:
     return tfds.core.ExampleSerializer(features(extras).get_serialized_info())
 
 
-def _tree(episode: Episode) -> dict[str, Any]:
+def _nested_example(episode: Episode) -> dict[str, Any]:
+    """Return an episode as TFDS nests its features. TFDS stores an image that is given as bytes without a change."""
     last = len(episode) - 1
     success = bool(episode.provenance.get("success", True))
     columns: dict[str, Sequence[Any] | NDArray[Any]] = {**episode.frames}

@@ -87,7 +87,7 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     for group in by_task.values():
         rows += twins(group, plan.seed, replay)
     for name, episodes in plan.episodes.items():
-        draws = Draws(name, plan.drawn_from(name), plan.seed, test)
+        draws = Draws(name, plan.axes_for(name), plan.seed, test)
         groups = [group for group in by_task.values() if _all_apply(draws.axes, group[0].task)]
         if not groups:
             raise PipelineError(

@@ -142,7 +142,7 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
 
 def configured(name: str, config: Config) -> Axis:
     """Return the axis with the ranges of the configuration, or else with its default ranges."""
-    return config.plan.axes.drawn().get(name) or AXES[name]()
+    return config.plan.axes.configured().get(name) or AXES[name]()
 
 
 def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> list[Perturbation]:
@@ -281,6 +281,6 @@ def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     stage = staged(tasks, config)
     # The deepest layer comes last: an axis that adds objects opens a scene for each perturbation, after which the
     # demonstration's scene would have to be opened again.
-    for name, axis in reversed(config.plan.axes.drawn().items()):
+    for name, axis in reversed(config.plan.axes.configured().items()):
         if axis.applies(stage.demo.task):
             axis_sheet(stage, name, config, test).save(folder / f"{name}.png")

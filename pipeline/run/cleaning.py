@@ -7,6 +7,7 @@ from typing import NamedTuple
 from pipeline.files import remove
 from pipeline.formats.base import EXPORT
 from pipeline.formats.registry import EXPORT_STAGES, FAILURES, formats_by
+from pipeline.run.claim import locked, refuse_unmarked
 from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.layout import (
     CARD,
@@ -29,7 +30,6 @@ from pipeline.run.layout import (
     WORK,
 )
 from pipeline.run.run import Run
-from pipeline.run.stage import locked, refuse_unmarked
 
 
 class Part(NamedTuple):

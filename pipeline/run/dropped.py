@@ -1,6 +1,6 @@
 """Finished work that a changed configuration no longer needs: measured, and reported before a stage deletes it.
 
-The stages ``plan``, ``replay`` and ``render`` call ``refuse_unasked`` before they replace or delete anything.
+The stages ``plan``, ``replay`` and ``render`` call ``refuse_deletion`` before they replace or delete anything.
 ``status`` and ``doctor`` report the result of ``measure``.
 """
 
@@ -104,7 +104,7 @@ def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
     )
 
 
-def refuse_unasked(rows: Sequence[plan.Row], run: Run) -> None:
+def refuse_deletion(rows: Sequence[plan.Row], run: Run) -> None:
     """Print how much finished work a plan drops, and stop if it is much and nobody allowed the deletion.
 
     Raises:

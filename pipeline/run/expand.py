@@ -94,7 +94,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     faults: dict[str, str] = {}
     while True:
-        verdicts = Replays(demos, REPLAY, store, workers).of(rows, faults)
+        verdicts = Replays(demos, REPLAY, store, workers).complete(rows, faults)
         outcome = selection.select(rows, verdicts, faults)
         kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
         new_faults = _faults(kept, rows, store)

@@ -47,6 +47,9 @@ LIBRARY = Path(__file__).parents[1]
 SEEN = LIBRARY / "testset" / "seen.json"
 """File of measures of the test tasks, which the report shows next to the measures of the run."""
 
+NO_RECORD = "no record of an earlier call"
+"""Reason of a stage that was never finished."""
+
 
 @dataclass(frozen=True)
 class Memory:
@@ -75,7 +78,7 @@ class Memory:
         try:
             record = self._read()
         except (PipelineError, OSError, LookupError, TypeError, ValueError):
-            return "no record of an earlier call"
+            return NO_RECORD
         outputs = self._contents()
         if record.matches(self.basis) and record.files != outputs:
             changed = sorted(name for name, _ in record.files.items() ^ outputs.items())

@@ -166,7 +166,7 @@ def outdated(
 
     The count includes finished files of today's plan, with today's settings, that were generated with other recipes,
     packages, machine code or another OpenGL device: see ``identity.refuse_unasked``. Files that a changed
-    configuration or plan replaces are not counted, as they need no permission.
+    configuration or plan replaces are not counted: ``dropped.refuse_deletion`` asks about them.
 
     Args:
         device: OpenGL name of the device that renders here; without it, frames of any device count as finished.

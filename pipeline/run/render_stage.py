@@ -110,6 +110,7 @@ def _needed(
         rejected: episode id to the reason why its frames were rejected.
         failures: reasons of dropped episodes that are rendered too.
     """
+    # Episodes of a trajectory share its replay and its files, so any of their rows names its demonstration and task.
     row_of = {row.trajectory_id: row for row in rows}
     planned: dict[str, dict[str, Stream]] = {trajectory_id: {} for trajectory_id in row_of}
     needed: dict[str, set[str]] = {}

@@ -33,7 +33,7 @@ class Replays:
     workers: Workers
     limits: FilterConfig = NO_LIMITS
 
-    def of(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
+    def complete(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
         """Replay what a plan needs and the store lacks; replay reserves only if a candidate failed.
 
         The twins come first, because tracking follows them.

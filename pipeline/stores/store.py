@@ -251,7 +251,7 @@ class Store(ABC):
     def outdated(self, names: Iterable[str]) -> Counter[str]:
         """Count, by reason, the finished files that count as missing.
 
-        Files with other settings are not counted: a user who changed the settings wants new files.
+        Files with other settings are not counted: ``run/dropped.py`` measures what a changed configuration drops.
 
         Raises:
             PipelineError: when a file is damaged.

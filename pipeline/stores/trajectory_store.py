@@ -26,6 +26,7 @@ class TrajectoryStore(Store):
     every machine can read it.
     """
 
+    # The stage `render` generates missing trajectories too: it replays reserves.
     step, stage = "physics", "render"
     columns: ClassVar = {
         "kept": pa.bool_(),

@@ -23,7 +23,7 @@ from pipeline.commands.command_line import parser
 from pipeline.files import edition
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.run import manifest
-from pipeline.run.stage import claimed
+from pipeline.run.claim import claimed
 
 VERBS = {
     "demos": ("fetch", "expand", "check"),

@@ -27,9 +27,9 @@ from pipeline.errors import PipelineError
 from pipeline.identity import REMAKE, made_with
 from pipeline.machine_code import SETTINGS
 from pipeline.planning import plan
+from pipeline.run.claim import locked
 from pipeline.run.render_job import RenderJob
 from pipeline.run.replay_stage import Replays
-from pipeline.run.stage import locked
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 
@@ -221,5 +221,5 @@ def test_replays_that_workers_leave_undone_are_named(tmp_path: Path) -> None:
     demos = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
     rows = plan.make(demos.index().entries, CLEAN, ReplayConfig(), NONE)
     with pytest.raises(PipelineError, match="1 trajectories were replayed and are still not there") as caught:
-        Replays(demos, ReplayConfig(), TrajectoryStore(tmp_path), lambda work, jobs, what: []).of(rows)
+        Replays(demos, ReplayConfig(), TrajectoryStore(tmp_path), lambda work, jobs, what: []).complete(rows)
     assert f"{rows[0].trajectory_id}.npz" in str(caught.value)

@@ -116,7 +116,7 @@ def test_each_bad_demonstration_is_a_verdict(
     wanted = PlanConfig(seed=0, axes=axes, episodes={"layout": count})
     rows = plan.make(index.entries, wanted, REPLAY, TestSet(()))
     folder = tmp_path / "trajectories"
-    verdicts = Replays(demos, REPLAY, TrajectoryStore(folder), loop).of(rows)
+    verdicts = Replays(demos, REPLAY, TrajectoryStore(folder), loop).complete(rows)
     log, store = capfd.readouterr().err, TrajectoryStore(folder)
     reasons = dict(zip([f"{NAME}/demo_{n}" for n in range(1, count - 1)], BAD.values(), strict=True))
     for row in rows:
@@ -132,7 +132,7 @@ def test_each_bad_demonstration_is_a_verdict(
             assert len(stored.actions) == 0
             assert detail in json.loads(stored.resolved)["fault"]
             assert re.search(rf"{row.demo_id}\b.*{detail}", log), row.demo_id
-    assert Replays(demos, REPLAY, TrajectoryStore(folder), nothing_left).of(rows) == verdicts
+    assert Replays(demos, REPLAY, TrajectoryStore(folder), nothing_left).complete(rows) == verdicts
     assert all(not verdict.kept for verdict in selection.select(rows, verdicts).values())
 
 

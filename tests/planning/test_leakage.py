@@ -31,7 +31,7 @@ from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
 from pipeline.planning.plan import Draws, Row
-from pipeline.run.stage import claimed
+from pipeline.run.claim import claimed
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Task

@@ -170,7 +170,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config, data = Config.model_validate(fields), tmp_path_factory.mktemp("run")
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
     plan.write(rows, data / "plan.parquet")
-    judged = Replays(config.demos, config.replay, TrajectoryStore(data / "trajectories"), loop).of(rows)
+    judged = Replays(config.demos, config.replay, TrajectoryStore(data / "trajectories"), loop).complete(rows)
     render_plan(rows, config, TrajectoryStore(data / "trajectories"), FrameStore(data / "frames", config.render), loop)
     outcome = selection.select(rows, judged)
     kept = [row for row in rows if outcome[row.episode_id].kept]

@@ -33,7 +33,7 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Row, TrajectoryS
     demos = DemosConfig(tasks=(str(WINE),))
     (entry,) = StarterSource().index([WINE]).entries
     (row,) = twins([entry], 0, ReplayConfig())
-    Replays(demos, ReplayConfig(), TrajectoryStore(folder), loop).of([row])
+    Replays(demos, ReplayConfig(), TrajectoryStore(folder), loop).complete([row])
     return row, TrajectoryStore(folder)
 
 
@@ -66,7 +66,7 @@ def test_a_run_that_asks_for_it_drops_the_wine_bottle(replayed: tuple[Row, Traje
     def nothing_to_do(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
         raise AssertionError("a trajectory that is there was replayed again")
 
-    judged = Replays(DemosConfig(), ReplayConfig(), store, nothing_to_do, DROP).of([row])
+    judged = Replays(DemosConfig(), ReplayConfig(), store, nothing_to_do, DROP).complete([row])
     assert judged == {name: Verdict(False, "exceeds_step_limit")}
 
 

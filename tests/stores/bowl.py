@@ -27,7 +27,7 @@ def bowl_plan(config: Config) -> list[plan.Row]:
 
 
 def replay_bowl(config: Config, folder: Path) -> None:
-    judged = Replays(config.demos, config.replay, TrajectoryStore(folder), loop).of(bowl_plan(config))
+    judged = Replays(config.demos, config.replay, TrajectoryStore(folder), loop).complete(bowl_plan(config))
     TrajectoryStore(folder).keep(judged)
     assert all(verdict.kept for verdict in judged.values())
 

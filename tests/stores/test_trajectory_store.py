@@ -88,7 +88,7 @@ def test_quality_is_stored_and_a_filter_drops_by_it(config: Config, rows: list[p
         assert verdicts_of(store.rows(), rows, FilterConfig(**{column: letting}))[name].kept
 
     limits = FilterConfig(path_m=figures["path_m"] / 2)
-    judged = Replays(config.demos, config.replay, TrajectoryStore(whole_replay), nothing_to_do, limits).of(rows)
+    judged = Replays(config.demos, config.replay, TrajectoryStore(whole_replay), nothing_to_do, limits).complete(rows)
     assert set(judged.values()) == {Verdict(False, "path_m")}
 
 
@@ -142,13 +142,13 @@ def test_a_damaged_trajectory_is_an_error_with_its_reason_and_is_never_silently_
         lambda: TrajectoryStore(trajectories).row(file.stem),
         lambda: TrajectoryStore(trajectories).load(file.stem),
         lambda: outcome.replayed(rows, TrajectoryStore(trajectories)),
-        lambda: Replays(config.demos, config.replay, TrajectoryStore(trajectories), nothing_to_do).of(rows),
+        lambda: Replays(config.demos, config.replay, TrajectoryStore(trajectories), nothing_to_do).complete(rows),
     ):
         with pytest.raises(PipelineError, match=rf"(?s){file.name}: damaged \(.+\).*move the file away"):
             read()
     assert file.read_bytes() == damaged
     file.rename(trajectories.parent / "moved away")
-    Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop).of(rows)
+    Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop).complete(rows)
     assert file.read_bytes() == whole
 
 
@@ -161,7 +161,7 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     fault(file)
     with pytest.raises(PipelineError, match=rf"(?s){file.name}.*stages/replay.py CONFIG"):
         outcome.replayed(rows, TrajectoryStore(trajectories))
-    Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop).of(rows)
+    Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop).complete(rows)
     assert file.read_bytes() == before
     assert outcome.replayed(rows, TrajectoryStore(trajectories))
 
@@ -313,9 +313,9 @@ def test_the_table_no_longer_tells_of_a_file_that_is_gone(trajectories: Path) ->
 def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_again(
     config: Config, rows: list[plan.Row], tmp_path: Path
 ) -> None:
-    judged = Replays(config.demos, config.replay, TrajectoryStore(tmp_path), given_up).of(rows)
+    judged = Replays(config.demos, config.replay, TrajectoryStore(tmp_path), given_up).complete(rows)
     assert judged == {rows[0].trajectory_id: Verdict(False, "worker_lost")}
-    assert Replays(config.demos, config.replay, TrajectoryStore(tmp_path), nothing_to_do).of(rows) == judged
+    assert Replays(config.demos, config.replay, TrajectoryStore(tmp_path), nothing_to_do).complete(rows) == judged
     assert {verdict.reason for verdict in selection.select(rows, judged).values()} == {"worker_lost"}
     assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
     assert outcome.replayed(rows, TrajectoryStore(tmp_path))

@@ -154,7 +154,7 @@ def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
         with shard.open("wb") as file:
             for episode_id in ids:
                 name = names[episode_id]
-                tree = rlds_write._tree(load(episode_id))
+                tree = rlds_write._nested_example(load(episode_id))
                 if isinstance(name, tuple) and name in IN_RLDS:
                     IN_RLDS[name](tree)
                 example = rlds_write._serializer().get_tf_example(rlds_write.features().encode_example(tree))

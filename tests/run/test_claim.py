@@ -21,7 +21,7 @@ from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.planning import plan
-from pipeline.run.stage import LOCK, OWNER, claimed, locked, owned
+from pipeline.run.claim import LOCK, OWNER, claimed, locked, owned
 
 
 @pytest.fixture
