@@ -33,7 +33,8 @@ FIXED = "Haswell AVX2"
 def ensure_fixed_machine_code(variables: Mapping[str, str] = SETTINGS) -> None:
     """Start this program again with the same arguments, unless the environment already has the variables.
 
-    The first statement of a program calls this. The call does not return where it starts the program again.
+    The first statement of a program calls this. Where it starts the program again, it does not return: the new program
+    replaces this process. Code that calls a program from within, such as a notebook, sets the variables itself.
 
     Args:
         variables: environment variables that the program needs from its start.

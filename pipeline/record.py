@@ -89,11 +89,14 @@ def differences(then: Mapping[str, str], now: Mapping[str, str], unnamed: Collec
     return ", ".join(descriptions)
 
 
+_ABSENT = object()
+
+
 def _changed(then: Any, now: Any, name: str = "settings or input files") -> list[str]:
     """List the differing parts of two requests: where both are mappings, the names of their values."""
     if not (isinstance(then, Mapping) and isinstance(now, Mapping)):
         return [] if then == now else [name]
     names: list[str] = []
     for key in dict.fromkeys([*then, *now]):
-        names += _changed(then.get(key), now.get(key), key)
+        names += _changed(then.get(key, _ABSENT), now.get(key, _ABSENT), key)
     return names

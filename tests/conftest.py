@@ -30,6 +30,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
+from pipeline.machine_code import SETTINGS
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -85,6 +86,12 @@ LONG = (
 
 The second module does not need the run of ``finished``, which the first module generates for all.
 """
+
+
+def pytest_configure() -> None:
+    """Stop without the fixed machine code: a program that a test calls would replace the tests' process."""
+    if not SETTINGS.items() <= os.environ.items():
+        raise pytest.UsageError("pytest-env has not set the machine code of pyproject.toml: run `bash setup.sh`")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -71,6 +71,26 @@ def test_a_program_starts_itself_once_with_the_settings(program: list[object], t
     assert done.stderr == f"ended with {SETTINGS['OPENBLAS_CORETYPE']} {arguments}\n"
 
 
+# Readers of finished files, a probe of OpenGL, and a stand-in that another program starts.
+WITHOUT_COMPUTATION = {"back_project", "load_rlds", "gl", "rehearsal_stand_ins", "recording_server", "faulty_server"}
+
+
+def test_every_program_of_this_project_starts_itself_with_the_settings() -> None:
+    files = subprocess.run(["git", "ls-files", "*.py"], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    programs = []
+    for path in map(Path, files.stdout.split()):
+        text = (REPOSITORY / path).read_text()
+        uses_project = re.search(r"^ *(from|import) (pipeline|conftest)\b", text, re.MULTILINE)
+        is_program = "__main__" in text and re.search(r'^if __name__ == "__main__":', text, re.MULTILINE)
+        if uses_project and is_program and "templates" not in path.parts and not path.name.startswith("test_"):
+            programs.append((path.stem, text))
+    assert len(programs) > 40
+    unprepared = {
+        name for name, text in programs if not re.search(r"(ensure_fixed_machine_code|perform_stage)\(", text)
+    }
+    assert unprepared == WITHOUT_COMPUTATION
+
+
 def test_no_file_is_stored_or_identified_with_other_machine_code() -> None:
     script = """
 from pathlib import Path

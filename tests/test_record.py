@@ -29,6 +29,7 @@ def test_the_same_basis_matches_also_after_a_round_through_json_and_in_another_o
             MADE_WITH,
             "other settings, plan.parquet, inputs.json and 2 more",
         ),
+        ({**REQUESTED, "optional": None}, MADE_WITH, "other optional"),
         (REQUESTED, {**MADE_WITH, "numpy": "2.3.0"}, "numpy 2.2.6, here 2.3.0"),
         (REQUESTED, {**MADE_WITH, "mujoco": "3.2.7"}, "mujoco none, here 3.2.7"),
     ],

@@ -17,6 +17,7 @@ from vla_eval.specs import IMAGE_RGB, LANGUAGE, STATE_EEF_POS_AA_GRIP, DimSpec
 from pipeline.evaluation.harness import ACTION
 from pipeline.evaluation.policies import VIEWS
 from pipeline.images.jpeg import resized
+from pipeline.machine_code import ensure_fixed_machine_code
 
 
 class SentenceServer(ModelServer):  # type: ignore[misc]
@@ -53,4 +54,5 @@ class SentenceServer(ModelServer):  # type: ignore[misc]
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     run_server(SentenceServer)

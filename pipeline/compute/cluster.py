@@ -18,6 +18,7 @@ from uuid import uuid4
 
 from packaging.requirements import Requirement
 
+from pipeline.compute.workers import VARIABLES
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, schema_file
 from pipeline.identity import DISTRIBUTION, PACKAGES
@@ -157,7 +158,7 @@ def _refusal(where: str, faults: list[str]) -> PipelineError:
         where=where,
         expected="workers that share the run's folders, packages, code and machine code, with one thread each",
         remedy="mount the repository and its data at the same path everywhere, install the same requirements.lock, and "
-        f"start the workers again with `export {in_shell(SETTINGS)}; dask worker ADDRESS --nthreads 1`",
+        f"start the workers again with `export {in_shell(SETTINGS | VARIABLES)}; dask worker ADDRESS --nthreads 1`",
     )
 
 

@@ -30,6 +30,7 @@ from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.machine_code import ensure_fixed_machine_code
 
 ACTION = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
 
@@ -229,4 +230,5 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     run_server(ReplayServer)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import Perturbation
+from pipeline.machine_code import fixed_machine_code
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
@@ -74,9 +75,13 @@ class Simulator(Environment):
 
     Args:
         files: files of the arena, by absolute paths; the task's own by default.
+
+    Raises:
+        PipelineError: when NumPy does not compute with the fixed machine code.
     """
 
     def __init__(self, task: Task, files: SceneFiles | None = None):
+        fixed_machine_code()
         arena = () if files is None else (_styles({"floor": files.floor, "wall": files.wall}), files.scene_xml)
         super().__init__(task, *arena)
         self._rewind: _Rewind | None = None

@@ -9,6 +9,7 @@ from pipeline import seeding
 from pipeline.axes.language import distance
 from pipeline.axes.noise import NoiseAxis
 from pipeline.episode_schema import SCHEMA
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.run.machine import trial
 
 
@@ -27,4 +28,5 @@ def compile_all() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     compile_all()

@@ -203,7 +203,7 @@ def test_without_work_nothing_is_started(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_only_replay_and_render_load_the_simulator() -> None:
     script = (
-        "import sys, runpy; "
+        "import sys, runpy, pipeline.stages; "
         "[runpy.run_path(f'stages/{stage}.py') for stage in ('plan', 'export_rlds', 'export_lerobot', 'manifest')]; "
         "print([name for name in ('mujoco', 'robosuite', 'tensorflow') if name in sys.modules])"
     )
