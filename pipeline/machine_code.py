@@ -26,6 +26,9 @@ SETTINGS = {
 }
 """Environment variables of OpenBLAS and NumPy."""
 
+STARTED_AGAIN = "PERTURBED_DEMOS_STARTED_AGAIN"
+"""Environment variable with the id of the process that has started itself again."""
+
 FIXED = "Haswell AVX2"
 """Result of ``machine_code`` under these settings, on x86 processors with AVX2."""
 
@@ -41,7 +44,12 @@ def ensure_fixed_machine_code(variables: Mapping[str, str] = SETTINGS) -> None:
     """
     if all(os.environ.get(name) == value for name, value in variables.items()):
         return
+    # The new program has the same process id. It continues even if something else, such as a `sitecustomize.py`, sets the
+    # variables at every start; `fixed_machine_code` then raises an error.
+    if os.environ.get(STARTED_AGAIN) == str(os.getpid()):
+        return
     os.environ.update(variables)
+    os.environ[STARTED_AGAIN] = str(os.getpid())
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 

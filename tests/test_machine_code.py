@@ -71,6 +71,14 @@ def test_a_program_starts_itself_once_with_the_settings(program: list[object], t
     assert done.stderr == f"ended with {SETTINGS['OPENBLAS_CORETYPE']} {arguments}\n"
 
 
+def test_a_program_starts_itself_once_also_where_every_start_sets_other_machine_code(tmp_path: Path) -> None:
+    overriding = f"import os; os.environ.update({OTHER})\n{REPORT_AT_EXIT}"
+    (tmp_path / "sitecustomize.py").write_text(overriding)
+    done = run_with_other_code("-m", "pipeline", "tasks", "--help", PYTHONPATH=str(tmp_path))
+    assert done.returncode == 0
+    assert done.stderr == "ended with Sandybridge ['tasks', '--help']\n"
+
+
 # Readers of finished files, a probe of OpenGL, and a stand-in that another program starts.
 WITHOUT_COMPUTATION = {"back_project", "load_rlds", "gl", "rehearsal_stand_ins", "recording_server", "faulty_server"}
 
