@@ -33,7 +33,7 @@ from pipeline.planning.streams import streams_of
 from pipeline.run.outcome import rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
-from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.frame_store import FrameStore, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.types import Trajectory
@@ -56,7 +56,7 @@ def main() -> None:
         render_plan(rows, config, TrajectoryStore(trajectories), FrameStore(frames, config.render), loop)
         rendered = time.process_time()
         store = FrameStore(frames, config.render)
-        outcome = selection.select(rows, verdicts, rejections(rows, shown_of(store.rows())))
+        outcome = selection.select(rows, verdicts, rejections(rows, frames_by_trajectory(store.rows())))
         kept = [row for row in rows if outcome[row.episode_id].kept]
         naive_s, same, count = 0.0, 0, 0
         for row in kept:

@@ -31,7 +31,7 @@ from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.renderer import Renderer
-from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.frame_store import FrameStore, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 
@@ -43,7 +43,7 @@ def main() -> None:
     data = arguments.data.resolve()
     config = load(data.resolve() / read_json(data / "configuration.json")["configuration"])
     store, trajectories = FrameStore(data / "frames", config.render), TrajectoryStore(data / "trajectories")
-    stored_rows = shown_of(store.rows())
+    stored_rows = frames_by_trajectory(store.rows())
     if any(stored_row.device != gl.choose().device for stored_row in stored_rows.values()) or not stored_rows:
         raise PipelineError("no current frames, or of another device", where=store.root, expected=gl.choose().device)
     streams: dict[str, dict[str, Stream]] = {}

@@ -44,8 +44,8 @@ def ensure_fixed_machine_code(variables: Mapping[str, str] = SETTINGS) -> None:
     """
     if all(os.environ.get(name) == value for name, value in variables.items()):
         return
-    # The new program has the same process id. It continues even if something else, such as a `sitecustomize.py`, sets the
-    # variables at every start; `fixed_machine_code` then raises an error.
+    # The new program has the same process id. It continues even if something else, such as a `sitecustomize.py`, sets
+    # the variables at every start; `fixed_machine_code` then raises an error.
     if os.environ.get(STARTED_AGAIN) == str(os.getpid()):
         return
     os.environ.update(variables)

@@ -45,7 +45,7 @@ from pipeline.run.outcome import outdated, rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.run.run import Run
-from pipeline.stores.frame_store import shown_of
+from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.testset import benchmark
 
 
@@ -172,7 +172,7 @@ def render(run: Run) -> None:
         rejected: dict[str, str] | None = None
         # `render_plan` renders reserves that are replayed already. This loop replays those that are not.
         while True:
-            rejected_now = rejections(rows, shown_of(run.frames.rows()))
+            rejected_now = rejections(rows, frames_by_trajectory(run.frames.rows()))
             if rejected_now == rejected:
                 break
             rejected = rejected_now

@@ -26,7 +26,7 @@ from pipeline.run.outcome import rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.run.verdicts import verdicts_of
-from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.frame_store import FrameStore, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 
@@ -76,7 +76,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
     frames, trajectories = FrameStore(folder / "frames", run.render), TrajectoryStore(folder / "trajectories")
     with runner(run.compute, folder, renders=True) as workers:
         rejected: dict[str, str] | None = None
-        while (rejected_now := rejections(rows, shown_of(frames.rows()))) != rejected:
+        while (rejected_now := rejections(rows, frames_by_trajectory(frames.rows()))) != rejected:
             rejected = rejected_now
             Replays(run.demos, run.replay, trajectories, workers, run.filter).complete(rows, rejected)
             outcome = selection.select(chosen, verdicts_of(trajectories.rows(), chosen, run.filter), rejected)

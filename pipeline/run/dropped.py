@@ -19,7 +19,7 @@ from pipeline.run.outcome import MISSED, rejections, rendered
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
-from pipeline.stores.frame_store import shown_of
+from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.types import Verdict
 
 LARGEST_SHARE = 0.1
@@ -127,7 +127,7 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
     """Return the ids of the trajectories that a plan may need, and pairs of trajectory id and id of a needed stream."""
     config = run.config
     verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
-    frames = shown_of(run.frames.rows())
+    frames = frames_by_trajectory(run.frames.rows())
     rejected = rejections(rows, frames)
     undecided = Verdict(False, NOT_REPLAYED)
     # A reserve is needed unless the candidates before it are replayed, rendered and kept.

@@ -14,7 +14,7 @@ from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
 from pipeline.run.verdicts import verdicts_of
 from pipeline.seeding import digest
-from pipeline.stores.frame_store import FrameStore, Shown, shown_of
+from pipeline.stores.frame_store import FrameStore, StoredFrames, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
@@ -46,7 +46,7 @@ class Outcome:
 
     rows: Sequence[plan.Row]
     trajectories: Mapping[str, Mapping[str, Any]]
-    frames: Mapping[str, Shown]
+    frames: Mapping[str, StoredFrames]
     verdicts: Mapping[str, Verdict]
     missed: Sequence[str] = ()
 
@@ -93,7 +93,7 @@ def replayed(
     return trajectories
 
 
-def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[str, str]:
+def rejections(rows: Sequence[plan.Row], frames: Mapping[str, StoredFrames]) -> dict[str, str]:
     """Map the ids of episodes with a rejected stream to the reason of the rejection.
 
     Args:
@@ -116,7 +116,7 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
     Raises:
         PipelineError: when a trajectory or a frame that the plan needs is missing, or can no longer be read.
     """
-    stored_frames = shown_of(frames.rows())
+    stored_frames = frames_by_trajectory(frames.rows())
     rejected = rejections(rows, stored_frames)
     replays = replayed(rows, trajectories, rejected, config.filter)
     judged = selection.select(rows, verdicts_of(replays, rows, config.filter), rejected)
@@ -144,7 +144,7 @@ def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: Expo
     return [row for row in failures if where.takes(row.axis, row.component, row.level, row.suite)]
 
 
-def rendered(row: plan.Row, frames: Mapping[str, Shown]) -> bool:
+def rendered(row: plan.Row, frames: Mapping[str, StoredFrames]) -> bool:
     """Return whether the frames that an episode shows are stored."""
     needed = {stream.stream_id for stream in streams_of(row.perturbations).values()}
     return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams

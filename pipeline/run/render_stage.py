@@ -15,7 +15,7 @@ from pipeline.planning.selection import select
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.run.outcome import MISSED, rejections
 from pipeline.run.verdicts import verdicts_of
-from pipeline.stores.frame_store import FrameStore, file_name, shown_of
+from pipeline.stores.frame_store import FrameStore, file_name, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
@@ -71,7 +71,9 @@ def render_plan(
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in frames.refresh().items() if row["device"] == device}
-        needed = _needed(rows, judged, rejections(rows, shown_of(stored)), MISSED if config.export.failures else ())
+        needed = _needed(
+            rows, judged, rejections(rows, frames_by_trajectory(stored)), MISSED if config.export.failures else ()
+        )
         missing = {name: portion for name, portion in needed.items() if name not in stored}
         if not missing:
             return set(needed)

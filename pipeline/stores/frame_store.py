@@ -28,7 +28,7 @@ _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 
 
 @dataclass(frozen=True)
-class Shown:
+class StoredFrames:
     """Record of one trajectory's stored frames, in all its files.
 
     Attributes:
@@ -190,13 +190,13 @@ def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
     return f"{trajectory_id}/{digest(*sorted(streams))[:16]}"
 
 
-def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
+def frames_by_trajectory(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, StoredFrames]:
     """Map trajectory ids to the records of their stored frames, from the rows of the table."""
-    stored: dict[str, Shown] = {}
+    stored: dict[str, StoredFrames] = {}
     for name, row in rows.items():
         trajectory_id = name.split("/")[0]
         if trajectory_id not in stored:
-            stored[trajectory_id] = Shown(row["made_by"], row["device"], row["replay_mode"])
+            stored[trajectory_id] = StoredFrames(row["made_by"], row["device"], row["replay_mode"])
         stored[trajectory_id].streams.update(row["streams"])
         stored[trajectory_id].rejected.update(json.loads(row["rejected"]))
     return stored

@@ -40,7 +40,7 @@ LABELS = ("suite", "task", "perturbations")
 
 
 @dataclass(frozen=True)
-class Found:
+class StoredEpisode:
     """An episode as a dataset describes it.
 
     Attributes:
@@ -100,7 +100,7 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
         PipelineError: when there is no such dataset, or it cannot be read.
     """
     manifest_rows = {} if manifest is None else _manifest(manifest)
-    episodes: list[Found] = []
+    episodes: list[StoredEpisode] = []
     for episode in read(dataset):
         if episode.perturbations is None and episode.episode_id in manifest_rows:
             row = manifest_rows[episode.episode_id]
@@ -126,7 +126,7 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
     )
 
 
-def read(dataset: Path) -> Iterator[Found]:
+def read(dataset: Path) -> Iterator[StoredEpisode]:
     """Yield the episodes of all datasets in or below a folder.
 
     Raises:
@@ -155,7 +155,7 @@ def _visible_files(folder: Path, name: str) -> list[Path]:
     return sorted(file for file in files if not re.search(r"(^|/)\.", str(file.relative_to(folder))))
 
 
-def _rlds(folder: Path) -> Iterator[Found]:
+def _rlds(folder: Path) -> Iterator[StoredEpisode]:
     features = tfds.builder_from_directory(folder).info.features
     for shard in sorted(folder.glob("*.tfrecord*")):
         for number, record in enumerate(records(shard)):
@@ -164,10 +164,10 @@ def _rlds(folder: Path) -> Iterator[Found]:
             text = {name: stored[name][0].decode() for name in ("episode_id", *LABELS) if name in stored}
             episode_id = text.pop("episode_id", "") or f"{shard.name}:{number}"
             instruction = step["language_instruction"][0].decode() or None
-            yield Found(episode_id, instruction, stored.get("image_extrinsics"), **text)
+            yield StoredEpisode(episode_id, instruction, stored.get("image_extrinsics"), **text)
 
 
-def _lerobot(folder: Path) -> Iterator[Found]:
+def _lerobot(folder: Path) -> Iterator[StoredEpisode]:
     lines = folder / "meta" / "episodes.jsonl"
     if lines.is_file():
         episodes = [json.loads(line) for line in lines.read_text().splitlines()]
@@ -185,7 +185,7 @@ def _lerobot(folder: Path) -> Iterator[Found]:
         index = episode["episode_index"]
         row = labels.get(index, {})
         matrix = row.get(camera_column("image", "extrinsics"))
-        yield Found(
+        yield StoredEpisode(
             row.get(EPISODE_ID) or ids.get(index) or f"episode {index}",
             next(iter(episode["tasks"]), None),
             None if matrix is None else np.reshape(matrix, SCHEMA.extrinsics.shape),
@@ -208,7 +208,7 @@ def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
     return {row["episode_id"]: row for row in rows.to_pylist()}
 
 
-def _row(episode: Found, task: Task | None, test: TestSet) -> Compared:
+def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
     """Describe an episode in the axes' parameters, as far as it shows them, or else by its labels."""
     perturbations = [p for p in _labels(episode) if task is not None or not _needs_task(p)]
     if episode.extrinsics is not None:
@@ -229,7 +229,7 @@ def _row(episode: Found, task: Task | None, test: TestSet) -> Compared:
     return Compared(episode.episode_id, task.suite, task.name, to_json([*perturbations, *rewrites]))
 
 
-def _labels(episode: Found) -> list[Perturbation]:
+def _labels(episode: StoredEpisode) -> list[Perturbation]:
     """Return the labels of an episode except language, which its instruction shows."""
     labels = () if episode.perturbations is None else from_json(episode.perturbations)
     return [p for p in labels if p.axis != "language"]
@@ -240,7 +240,7 @@ def _needs_task(perturbation: Perturbation) -> bool:
     return perturbation.same is not None
 
 
-def _task_of(episode: Found) -> Task | None:
+def _task_of(episode: StoredEpisode) -> Task | None:
     """Find the task by the labels, or else by the instruction; labels may name a third-party suite."""
     if episode.suite and episode.task:
         try:

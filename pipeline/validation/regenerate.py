@@ -30,7 +30,7 @@ from pipeline.run.export import export
 from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.run.render_job import RenderJob
 from pipeline.run.replay_job import ReplayJob
-from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.frame_store import FrameStore, frames_by_trajectory
 from pipeline.types import Verdict
 
 
@@ -127,7 +127,7 @@ def _rebuild(
         return None, verdict.reason
     streams = tuple(streams_of(planned.perturbations).values())
     RenderJob(planned, streams, trajectories, frames, settings.render, gl.choose().device)()
-    rejected = shown_of(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected
+    rejected = frames_by_trajectory(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected
     if rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(out, settings.render)

@@ -18,7 +18,7 @@ from pipeline.run.layout import CARD, COUNTS, FINETUNE, INPUTS, LEAKAGE, MACHINE
 from pipeline.run.outcome import outdated
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
-from pipeline.stores.frame_store import Shown, shown_of
+from pipeline.stores.frame_store import StoredFrames, frames_by_trajectory
 from pipeline.types import Verdict
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
 
@@ -42,7 +42,7 @@ def told(run: Run) -> Iterator[str | Table]:
         yield f"the run cannot be planned: {error}"
         return
     verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
-    frames = shown_of(run.frames.rows())
+    frames = frames_by_trajectory(run.frames.rows())
     rejected = outcome.rejections(rows, frames)
     judged = selection.select(rows, verdicts, rejected)
     yield _counts(config, rows, judged, frames)
@@ -73,7 +73,7 @@ def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verd
 
 
 def _counts(
-    config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]
+    config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
 ) -> Table:
     table = Table("axis", "wanted", "planned", "reach their goal", "rendered", title="episodes")
     for column in table.columns[1:]:
@@ -95,7 +95,7 @@ def _steps(
     run: Run,
     rows: Sequence[plan.Row],
     verdicts: Mapping[str, Verdict],
-    frames: Mapping[str, Shown],
+    frames: Mapping[str, StoredFrames],
     rejected: Mapping[str, str],
 ) -> Iterator[tuple[str, str]]:
     if not rows:
@@ -196,7 +196,7 @@ def _time_left(
     run: Run,
     needed: Sequence[plan.Row],
     verdicts: Mapping[str, Verdict],
-    frames: Mapping[str, Shown],
+    frames: Mapping[str, StoredFrames],
     steps: Mapping[str, str],
 ) -> Iterator[str]:
     """Estimate the time left, from the speed that ``doctor`` measured, the needed rows and the stages to run."""
@@ -215,7 +215,7 @@ def _time_left(
 
 
 def not_made(
-    needed: Sequence[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, Shown]
+    needed: Sequence[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
 ) -> dict[str, float]:
     """Return the shares in [0, 1] of the trajectories and streams that ``replay`` and ``render`` still have to do.
 

@@ -86,7 +86,9 @@ def test_a_log_says_how_far_long_work_is(
 
 @pytest.mark.slow
 def test_work_that_ends_its_workers_is_given_up_or_ends_the_run_with_words(tmp_path: Path) -> None:
-    expendable = Expendable(die_or_hang, limit_s=lambda number: 2.0 if number == 3 else 300.0, lost=lambda number: -number)
+    expendable = Expendable(
+        die_or_hang, limit_s=lambda number: 2.0 if number == 3 else 300.0, lost=lambda number: -number
+    )
     with runner(ComputeConfig(cluster="local", workers=2), tmp_path) as run:
         assert run(expendable, [1, 2, 3, 4, 5], "some deaths") == [1, -2, -3, 4, 5]
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):

@@ -17,7 +17,7 @@ from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
 from pipeline.run.outcome import Outcome, missed
-from pipeline.stores.frame_store import Shown
+from pipeline.stores.frame_store import StoredFrames
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
 
@@ -37,8 +37,8 @@ def run() -> Outcome:
         rows,
         {twin.trajectory_id: told, robot.trajectory_id: told | {"mode": "tracked", "steps": 120, "path_m": 0.75}},
         {
-            twin.trajectory_id: Shown("", "a GPU", "open_loop", shown),
-            robot.trajectory_id: Shown("", "a GPU", "tracked", rejected={"a stream": "too_dark"}),
+            twin.trajectory_id: StoredFrames("", "a GPU", "open_loop", shown),
+            robot.trajectory_id: StoredFrames("", "a GPU", "tracked", rejected={"a stream": "too_dark"}),
         },
         {row.episode_id: Verdict(row.wanted, "kept" if row.wanted else "reserve_not_needed") for row in rows}
         | {robot.episode_id: Verdict(False, "too_dark")},
