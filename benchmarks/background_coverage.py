@@ -69,7 +69,7 @@ def main() -> None:
         environment = Environment(task)
         renderer = Renderer(environment.place_fixtures(4))
         environment.close()
-        state = StarterSource().of(task).init_state
+        state = StarterSource().demonstration(task).init_state
         figures[arena] = {component: shares(renderer, state, parts) for component, parts in COMPONENTS.items()}
         renderer.close()
     print(json.dumps(figures, indent=1))

@@ -71,7 +71,7 @@ def demonstrations(wanted: DemosConfig) -> None:
 
 
 def _recordings(task: Task, starter: StarterSource) -> Iterator[hdf5.Recording]:
-    demo = starter.of(task)
+    demo = starter.demonstration(task)
     model_xml = demo.model_xml or shared(task).place_fixtures(0)
     for number in range(PUBLISHED):
         noise = seeding.rng("rehearsal", number).normal(0, [*[0.01] * 6, 0], (STEPS, 7))  # no noise on the gripper

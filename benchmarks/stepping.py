@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(TASKS))
     measured = []
     for task in select_tasks(parser.parse_args().tasks):
-        measured.append(compare(StarterSource().of(task)))
+        measured.append(compare(StarterSource().demonstration(task)))
         print(f"{task.suite}/{task.name}: {json.dumps(measured[-1])}")
     steps = sum(row["control_steps"] for row in measured)
     ours = sum(row["ours_ms"] * row["control_steps"] for row in measured) / steps

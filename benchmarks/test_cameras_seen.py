@@ -59,7 +59,7 @@ def main() -> None:
 
 def measure(task: Task) -> list[dict[str, Any]]:
     """Return a line for LIBERO's own camera and for each test camera of a task."""
-    demo = StarterSource().of(task)
+    demo = StarterSource().demonstration(task)
     trajectory = replay(shared(task), demo, "test_cameras", ReplayConfig(mode="open_loop"))
     arena = bddl.read(task.bddl_file).arena
     renderer = Renderer(trajectory.model_xml)

@@ -82,7 +82,7 @@ def _frames(simulator: Simulator, arena: str) -> Iterator[tuple[str, float]]:
         yield f"background: share of {view} that surface changes", float(on_surface.mean())
         yield f"background: share of {view} that theme changes", float((on_surface | around).mean())
     clean = renderer.frame("agentview")
-    tests = {(test.component, test.parameters["severity"]): test for test in benchmark.load().of("noise")}
+    tests = {(test.component, test.parameters["severity"]): test for test in benchmark.load().on_axis("noise")}
     for test in tests.values():
         if test.parameters["severity"] in SEVERITIES:
             noisy = libero_plus.noise(test, 0).apply(clean, 0)

@@ -85,7 +85,7 @@ def reference(suite: str, name: str) -> Reference | None:
     try:
         for settle_steps in (ReplayConfig().settle_steps, 0):
             config = ReplayConfig(mode="open_loop", settle_steps=settle_steps)
-            trajectory = replay(environment, StarterSource().of(task), name, config)
+            trajectory = replay(environment, StarterSource().demonstration(task), name, config)
             if trajectory.verdict.kept:
                 return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
     finally:

@@ -138,7 +138,7 @@ def memory() -> Iterator[None]:
 
 
 def starter_demo(task: Task) -> Demo:
-    return StarterSource().of(task)
+    return StarterSource().demonstration(task)
 
 
 Once = Callable[[str, Callable[[Path], None]], Path]

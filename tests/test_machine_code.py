@@ -130,7 +130,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import shared
 from pipeline.physics.replay import replay
 task = find_task("libero_goal", "turn_on_the_stove")
-replay(shared(task), StarterSource().of(task), "clean", ReplayConfig())
+replay(shared(task), StarterSource().demonstration(task), "clean", ReplayConfig())
 """
     done = run_with_other_code("-c", script)
     assert "NumPy computes with Sandybridge" in done.stderr

@@ -201,7 +201,7 @@ from pipeline.rendering.renderer import Renderer
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 made, read = (TrajectoryStore(Path(folder)) for folder in sys.argv[1:])
-demo = StarterSource().of(find_task("libero_goal", "turn_on_the_stove"))
+demo = StarterSource().demonstration(find_task("libero_goal", "turn_on_the_stove"))
 short = replace(demo, actions=demo.actions[:3])
 made.save(replay(Environment(demo.task), short, "made", ReplayConfig(noops="keep")))
 trajectory = read.load("made")

@@ -116,7 +116,7 @@ class BackgroundPerturbation(RenderPerturbation):
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return one distance for all test tasks: 0 if any of them shows one of the images, on any part, else 1."""
         is_tested = any(_is_tested(covering, test) for covering in self.coverings)
-        return np.full(len(test.of("background")), 0.0 if is_tested else 1.0)
+        return np.full(len(test.on_axis("background")), 0.0 if is_tested else 1.0)
 
     def apart(self, others: Sequence[BackgroundPerturbation]) -> Floats:
         """Return 0 for perturbations that share an image with this one, 1 for the others (N,)."""
@@ -212,7 +212,7 @@ def _offered(sources: tuple[Source, ...], families: tuple[str | None, ...]) -> l
 def _images_of(test: TestSet) -> frozenset[str]:
     """Return the normalised names of the images that test tasks show."""
     names: set[str] = set()
-    for tested in test.of("background"):
+    for tested in test.on_axis("background"):
         for part in ("surface", "wall"):
             file = tested.parameters.get(part)
             if isinstance(file, str):

@@ -93,7 +93,7 @@ class Perturbation(Frozen):
 
         A distance is NaN if the two cannot be compared, such as wordings of different tasks.
         """
-        distances = np.full(len(test.of(self.axis)), np.nan)
+        distances = np.full(len(test.on_axis(self.axis)), np.nan)
         if self.same:
             distances[test.places(task, self.axis, self.same)] = self.distances_on(test, task)
         return distances

@@ -157,7 +157,7 @@ def _angle_deg(cosine: Floats) -> Floats:
 def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
     """Return the distinct cameras of the test set, and each test task's index among them."""
     listed = []
-    for task in test.of("camera"):
+    for task in test.on_axis("camera"):
         listed.append([float(task.parameters[name]) for name in PARAMETERS])
     parameters = np.array(listed).reshape(-1, len(PARAMETERS))
     distinct, places = np.unique(parameters, axis=0, return_inverse=True)

@@ -295,4 +295,4 @@ def _distances(text: str, test: TestSet, task: Task) -> list[float]:
 @cache
 def _all_test_wordings(test: TestSet) -> frozenset[str]:
     """Return the normalised test instructions of all tasks."""
-    return frozenset(normalise(str(tested.parameters["text"])) for tested in test.of("language"))
+    return frozenset(normalise(str(tested.parameters["text"])) for tested in test.on_axis("language"))

@@ -107,7 +107,7 @@ def _tested(test: TestSet, component: Component, name: str) -> tuple[tuple[float
         The distinct values, ascending. The place of each noise task's value among them (N,), counted from 1; NaN for
         test tasks of other components.
     """
-    values = [float(t.parameters[name]) if t.component == component else np.nan for t in test.of("noise")]
+    values = [float(t.parameters[name]) if t.component == component else np.nan for t in test.on_axis("noise")]
     ascending = sorted({value for value in values if not np.isnan(value)})
     places = [np.nan if np.isnan(value) else 1.0 + ascending.index(value) for value in values]
     return tuple(ascending), np.array(places)
@@ -183,7 +183,7 @@ class NoiseAxis(Axis):
         Noise has one strength for each component and level. With the default strengths, held-out perturbations would
         equal the perturbations of plans. Plans keep their clearance to the benchmark's strengths.
         """
-        tests = benchmark.load().of("noise")
+        tests = benchmark.load().on_axis("noise")
         effects = {(test.component, test.parameters["severity"]): effect_of(test) for test in tests}
         grids = {}
         for component in dict.fromkeys(test.component for test in tests):

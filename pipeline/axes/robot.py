@@ -91,7 +91,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the offsets of all robot tasks; all tasks share one arm."""
-        rows = [int(tested.parameters["id"]) - 1 for tested in test.of("robot")]
+        rows = [int(tested.parameters["id"]) - 1 for tested in test.on_axis("robot")]
         return self._apart_rad(benchmark_offsets_rad())[rows]
 
     def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
@@ -103,7 +103,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
         All tasks share one arm, so the distance does not depend on ``task``.
         """
-        compared = len(test.of("robot"))
+        compared = len(test.on_axis("robot"))
         if not compared:
             return Nearest(np.inf, compared)
         return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()), compared)

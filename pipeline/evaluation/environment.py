@@ -238,7 +238,7 @@ class EpisodeEnvironment:
     def _start_libero(self) -> None:
         """Start an episode of a LIBERO task, with held-out perturbations if the task has any."""
         self._build(self._base)
-        seed, demo, recorded = self.settings.fixture_seed, StarterSource().of(self._base), True
+        seed, demo, recorded = self.settings.fixture_seed, StarterSource().demonstration(self._base), True
         if self.settings.initial_states == "libero":
             seed, state = self._initial_state()
             demo, recorded = replace(demo, init_state=state), False

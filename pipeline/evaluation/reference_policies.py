@@ -35,7 +35,7 @@ class Replay:
 
     def begin(self, task: EvaluationTask) -> None:
         """Begin with the first action of the task's demonstration."""
-        recorded = StarterSource().of(find_task(task.suite, task.base)).actions
+        recorded = StarterSource().demonstration(find_task(task.suite, task.base)).actions
         self._actions, self._taken = recorded[kept_actions(recorded, "drop")], 0
 
     def act(self, look: Look) -> Floats:
@@ -82,7 +82,7 @@ class TrackedReplay:
 @lru_cache(maxsize=8)
 def _reference(suite: str, base: str) -> Reference:
     """Return the demonstration as observations show it, replayed open-loop from its own first state."""
-    demo = StarterSource().of(find_task(suite, base))
+    demo = StarterSource().demonstration(find_task(suite, base))
     actions = demo.actions[kept_actions(demo.actions, "drop")]
     with closing(Simulator(demo.task)) as simulator:
         scene = recorded_start(demo, simulator.place_fixtures(0))

@@ -275,7 +275,7 @@ class Evaluated:
     videos: Mapping[str, Path]
     refused: int
 
-    def of(self, source: str) -> list[EpisodeResult]:
+    def from_source(self, source: str) -> list[EpisodeResult]:
         """Return the episodes on the tasks of one source."""
         return [row for row in self.rows if row.source == source]
 

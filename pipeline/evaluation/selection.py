@@ -288,7 +288,7 @@ def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
     No scene is built.
     """
     drawn: list[EvaluationTask] = []
-    tested = [axis for axis in OWN_AXES if load().of(axis)]
+    tested = [axis for axis in OWN_AXES if load().on_axis(axis)]
     for suite, axis in product(TESTED_SUITES, tested):
         drawn += islice(_drawn_tasks(suite, axis, seed), each)
     return drawn

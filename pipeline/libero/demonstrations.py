@@ -123,16 +123,16 @@ class StarterSource:
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         """Index the demonstration of each task."""
         del per_task  # Each task has one demonstration, and a count is at least one.
-        return DemoIndex([DemoEntry.of(self.of(task)) for task in wanted], [])
+        return DemoIndex([DemoEntry.of(self.demonstration(task)) for task in wanted], [])
 
     def load(self, demo_id: str) -> Demo:
         """Load one demonstration, by its id."""
-        demo = self.of(_parse(demo_id)[0])
+        demo = self.demonstration(_parse(demo_id)[0])
         if demo.demo_id != demo_id:
             raise PipelineError(f"the starter set has no {demo_id}", expected=demo.demo_id)
         return demo
 
-    def of(self, task: Task) -> Demo:
+    def demonstration(self, task: Task) -> Demo:
         """Load the task's only demonstration."""
         if task.suite not in SUITES:
             raise PipelineError(f"the starter set has no demonstration of {task}", expected="a LIBERO task")

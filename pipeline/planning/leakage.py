@@ -114,7 +114,7 @@ def check(rows: Sequence[Row | Compared], test: TestSet) -> dict[str, AxisDistan
     findings = {}
     for axis, comparisons in compared.items():
         least = distances(axis, wanted[axis], test)
-        findings[axis] = _finding(comparisons, len(test.of(axis)), coverage(axis, least, test))
+        findings[axis] = _finding(comparisons, len(test.on_axis(axis)), coverage(axis, least, test))
     return findings
 
 
@@ -123,7 +123,7 @@ def distances(axis: str, draws: Iterable[tuple[Perturbation, Task]], test: TestS
 
     It is NaN if the test task cannot be compared with any of them, or if the axis's measure has no unit.
     """
-    least = np.full(len(test.of(axis)), np.nan)
+    least = np.full(len(test.on_axis(axis)), np.nan)
     for perturbation, task in draws:
         if perturbation.unit is not None:
             np.fmin(least, perturbation.distances(test, task), out=least)
@@ -132,7 +132,7 @@ def distances(axis: str, draws: Iterable[tuple[Perturbation, Task]], test: TestS
 
 def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
     """Summarize the result of :func:`distances` for each component of the axis's test tasks."""
-    components = np.array([tested.component for tested in test.of(axis)])
+    components = np.array([tested.component for tested in test.on_axis(axis)])
     summaries = {}
     for component in dict.fromkeys(components.tolist()):
         of_component = least[components == component]

@@ -223,7 +223,7 @@ class Draws:
     seed: int
     test: TestSet
 
-    def of(
+    def sample(
         self, demo_id: str, task: Task, dealt: Dealt | None = None, expanded_by: str = "[]"
     ) -> Iterator[tuple[Perturbation, ...]]:
         """Sample for one demonstration, variant after variant: all different, and each at its clearance from all tests.
@@ -339,7 +339,7 @@ def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[Demo
         Demonstration, perturbations and number of the variant.
     """
     dealt = Dealt()
-    samplers = {demo: draws.of(demo.demo_id, demo.task, dealt, demo.perturbations) for demo in group}
+    samplers = {demo: draws.sample(demo.demo_id, demo.task, dealt, demo.perturbations) for demo in group}
     for variant in count():
         for demo, sampler in [*samplers.items()]:
             perturbations = next(sampler, None)

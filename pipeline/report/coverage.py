@@ -46,7 +46,7 @@ class AxisPlots(NamedTuple):
     panels: list[Panel]
 
 
-def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
+def plot_axis(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     """Plot the coverage of one axis by its perturbations."""
     plots: dict[str, Callable[[Sequence[Any], TestSet], AxisPlots]] = {
         **{"camera": _camera, "light": _light, "background": _background, "noise": _noise},
@@ -55,7 +55,7 @@ def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     made: Sequence[Any] = draws if axis in ("language", "layout") else [draw.made for draw in draws]
     axis_plots = plots[axis](made, test) if axis in plots else _numbers(axis, made, test)
     unit = AXES[axis].draws[0].unit
-    if unit is None or not test.of(axis):
+    if unit is None or not test.on_axis(axis):
         return axis_plots
     return AxisPlots(axis_plots.note, [*axis_plots.panels, _distances(axis, draws, test, unit)])
 
@@ -66,7 +66,7 @@ def _distances(axis: str, draws: Sequence[Draw], test: TestSet, unit: str) -> Pa
     Test tasks that cannot be compared with any perturbation are left out.
     """
     least = leakage.distances(axis, [(draw.made, draw.task) for draw in draws], test)
-    components = np.array([task.component for task in test.of(axis)])
+    components = np.array([task.component for task in test.on_axis(axis)])
     rows = {}
     for component in dict.fromkeys(components.tolist()):
         comparable = (components == component) & np.isfinite(least)
@@ -81,7 +81,7 @@ def _numbers(axis: str, draws: Sequence[Perturbation], test: TestSet) -> AxisPlo
     for name in ("level", *names):
         values = np.array([getattr(draw, name) for draw in draws], float)
         panels.append(strips(name.replace("_", " "), {"draws": {axis: values}}, name))
-    return AxisPlots(f"{len(test.of(axis)):,} test tasks.", panels)
+    return AxisPlots(f"{len(test.on_axis(axis)):,} test tasks.", panels)
 
 
 def _points(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Floats:
@@ -93,7 +93,7 @@ def _points(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Float
 
 
 def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> AxisPlots:
-    tested = [task.parameters for task in test.of("camera")]
+    tested = [task.parameters for task in test.on_axis("camera")]
 
     def points(*names: str) -> dict[str, Floats]:
         """Return distinct points of the test tasks, many of which share a camera, and the perturbations' points."""
@@ -121,15 +121,15 @@ def _light(draws: Sequence[LightPerturbation], test: TestSet) -> AxisPlots:
         "direction": ("lamps tilted by (°)", [p.tilt_deg for p in draws]),
     }
     return AxisPlots(
-        f"{len(test.of('light')):,} test tasks, whose values are unknown offline: they are published only within the "
-        f"benchmark's asset archive. {sum(p.shadows for p in draws)} of {len(draws)} draws cast shadows.",
+        f"{len(test.on_axis('light')):,} test tasks, whose values are unknown offline: they are published only within "
+        f"the benchmark's asset archive. {sum(p.shadows for p in draws)} of {len(draws)} draws cast shadows.",
         [strips(name, {"draws": {"light": np.array(own)}}, label) for name, (label, own) in columns.items()],
     )
 
 
 def _background(draws: Sequence[BackgroundPerturbation], test: TestSet) -> AxisPlots:
     names = [covering.texture for p in draws for covering in p.coverings]
-    tested = test.of("background")
+    tested = test.on_axis("background")
     images = {task.parameters[part] for task in tested for part in ("surface", "wall") if part in task.parameters}
     # Examples of names: procedural:brick/028, metaworld:floor2.png.
     sources = Counter(name.rpartition("/" if "/" in name else ":")[0] for name in names)
@@ -142,9 +142,9 @@ def _background(draws: Sequence[BackgroundPerturbation], test: TestSet) -> AxisP
 
 def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> AxisPlots:
     rows = {}
-    for component in dict.fromkeys(task.component for task in test.of("noise")):
+    for component in dict.fromkeys(task.component for task in test.on_axis("noise")):
         of_component = [p for p in draws if p.component == component]
-        tested = [task.parameters for task in test.of("noise") if task.component == component]
+        tested = [task.parameters for task in test.on_axis("noise") if task.component == component]
         severities: Floats = np.unique([float(parameters["severity"]) for parameters in tested])
         at = np.array([])
         if of_component:
@@ -154,14 +154,14 @@ def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> AxisPlots:
             at = np.interp([float(getattr(p.effect, name)) for p in of_component], values, steps)
         rows[component] = {"benchmark": severities, "noise": at}
     return AxisPlots(
-        f"{len(test.of('noise')):,} test tasks at ten severities of each kind; a draw stands where its strength would, "
-        "on the benchmark's scale.",
+        f"{len(test.on_axis('noise')):,} test tasks at ten severities of each kind; a draw stands where its strength "
+        "would, on the benchmark's scale.",
         [strips("strength by kind", rows, "severity")],
     )
 
 
 def _language(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
-    tested = test.of("language")
+    tested = test.on_axis("language")
     original = {(t.suite, t.base): find_task(t.suite, t.base).instruction for t in tested}
     far = np.array([distance(str(t.parameters["text"]), original[t.suite, t.base]) for t in tested])
     edited = [(draw.made.component, distance(draw.made.text, draw.task.instruction)) for draw in draws]
@@ -181,7 +181,7 @@ def _language(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
 
 
 def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
-    tested = [task.parameters for task in test.of("layout")]
+    tested = [task.parameters for task in test.on_axis("layout")]
     tested_at = []
     for parameters in tested:
         tested_at += [pair.split(",") for pair in str(parameters["positions"]).split(";") if pair]
@@ -206,7 +206,7 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
 
 
 def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) -> AxisPlots:
-    tested = [task.parameters for task in test.of("pose")]
+    tested = [task.parameters for task in test.on_axis("pose")]
     targets = _points([parameters for parameters in tested if "dx_m" in parameters], ("dx_m", "dy_m"))
     alone = [p for p in draws if isinstance(p, PosePerturbation)]
     scenes = [p for p in draws if isinstance(p, ScenePerturbation)]
@@ -232,7 +232,7 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
 
 
 def _robot(draws: Sequence[RobotPerturbation], test: TestSet) -> AxisPlots:
-    ids = [int(task.parameters["id"]) - 1 for task in test.of("robot")]
+    ids = [int(task.parameters["id"]) - 1 for task in test.on_axis("robot")]
     tested = benchmark_offsets_rad()[ids].reshape(-1, 7)
     offsets = np.array([p.joint_offsets_rad for p in draws]).reshape(-1, 7)
     joints = {f"joint {n + 1}": {"benchmark": np.unique(tested[:, n]), "robot": offsets[:, n]} for n in range(7)}

@@ -38,7 +38,9 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     """
     present = {row.source for policy in policies for row in policy.rows}
     sources = [*(source for source in SOURCES if source in present), *sorted(present.difference(SOURCES))]
-    tested = {policy.name: policy.of("libero_plus") for policy in policies if policy.of("libero_plus")}
+    tested = {
+        policy.name: policy.from_source("libero_plus") for policy in policies if policy.from_source("libero_plus")
+    }
     return {
         "policies": {policy.name: _policy_findings(policy, sources) for policy in policies},
         "common": {source: _common_trials(policies, source) for source in sources},
@@ -52,7 +54,7 @@ def _policy_findings(policy: Evaluated, sources: Sequence[str]) -> dict[str, Any
     results = {}
     overall = success_rate(policy.rows)
     for source in sources:
-        rows = policy.of(source)
+        rows = policy.from_source(source)
         if rows:
             results[source] = summary(rows)
     return {
@@ -68,7 +70,7 @@ def _common_trials(policies: Sequence[Evaluated], source: str) -> int:
     """Count the trials of a source that all policies ran, out of the policies that ran any trial of it."""
     trials = []
     for policy in policies:
-        rows = policy.of(source)
+        rows = policy.from_source(source)
         if rows:
             trials.append({row.trial for row in rows})
     return len(set.intersection(*trials))
@@ -78,7 +80,7 @@ def _comparisons(policies: Sequence[Evaluated], sources: Sequence[str]) -> list[
     comparisons = []
     for source in sources:
         for first, second in combinations(policies, 2):
-            pairs = paired(first.of(source), second.of(source))
+            pairs = paired(first.from_source(source), second.from_source(source))
             if pairs:
                 comparisons.append({"source": source, "first": first.name, "second": second.name, **compare(pairs)})
     return comparisons

@@ -158,7 +158,7 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
         what = f"the axis {name} has nothing to change in {demo.task}"
         raise PipelineError(what, remedy="choose another task or another axis")
     axis.refuse_tested(test, demo.task)
-    draws = Draws(name, (axis,), seed, test).of(demo.demo_id, demo.task, expanded_by=demo.perturbations)
+    draws = Draws(name, (axis,), seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
     left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
     chosen: list[Perturbation] = []
     count = PHYSICS_VARIANTS if of_layer(left, PhysicsPerturbation) else VARIANTS

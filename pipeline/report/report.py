@@ -190,7 +190,7 @@ def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
             if row["kept"]:
                 resolved = json.loads(row["resolved"]).get(axis)
                 draws.append(Draw(find_task(row["suite"], row["task"]), made, resolved))
-        plots_and_tables[axis] = coverage.of(axis, draws, test), table
+        plots_and_tables[axis] = coverage.plot_axis(axis, draws, test), table
     return plots_and_tables
 
 

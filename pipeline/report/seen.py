@@ -157,7 +157,7 @@ def measure(run: Run, test: TestSet) -> list[Measure]:
     sampled: list[Row] = []
     for axis in dict.fromkeys(row.axis for row in kept):
         sampled += [row for row in kept if row.axis == axis][:SAMPLE]
-    ours = _summaries(chain(*map(seen.of, sampled), to_nearest_draw(test, kept)))
+    ours = _summaries(chain(*map(seen.measure, sampled), to_nearest_draw(test, kept)))
     run_once = {name: Spread(*values) for name, values in json.loads(SEEN.read_text()).items()}
     tested = run_once | _summaries(chain(*map(_of_test, test.tasks), to_nearest_test(test)))
     measures = []
@@ -187,7 +187,7 @@ class _Seen:
         self._twins = twins
         self._looks: dict[tuple[str, int], Look] = {}
 
-    def of(self, row: Row) -> Iterator[tuple[str, float]]:
+    def measure(self, row: Row) -> Iterator[tuple[str, float]]:
         """Yield the measures of an episode that is unperturbed or perturbed on one axis."""
         twin = self._twins.get(row.twin_id)
         match from_json(row.perturbations):
@@ -269,12 +269,12 @@ def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, f
 
 def to_nearest_test(test: TestSet) -> Iterator[tuple[str, float]]:
     """Measure the distances of pose tests to the nearest place in another test of the same task."""
-    moved = (((task.suite, task.base), (task.name, displacements(task.parameters))) for task in test.of("pose"))
+    moved = (((task.suite, task.base), (task.name, displacements(task.parameters))) for task in test.on_axis("pose"))
     return _to_nearest(test, grouped(moved))
 
 
 def _to_nearest(test: TestSet, places: Places) -> Iterator[tuple[str, float]]:
-    for tested in test.of("pose"):
+    for tested in test.on_axis("pose"):
         tested_shifts = displacements(tested.parameters)
         others = [shifts for name, shifts in places[tested.suite, tested.base] if name != tested.name]
         for thing in bddl.read(find_task(tested.suite, tested.base).bddl_file).things_of_interest:

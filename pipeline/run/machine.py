@@ -67,7 +67,7 @@ def trial() -> Trial:
     from pipeline.rendering.drawing import PlainDrawing
     from pipeline.rendering.renderer import Renderer
 
-    demo = StarterSource().of(find_task(*TRIAL_TASK))
+    demo = StarterSource().demonstration(find_task(*TRIAL_TASK))
     environment = Environment(demo.task)
     short = replace(demo, actions=demo.actions[:TRIAL_STEPS])
     trajectory = replay(environment, short, "trial", ReplayConfig(mode="open_loop", noops="keep"))

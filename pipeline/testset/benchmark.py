@@ -62,13 +62,13 @@ class TestSet:
 
     tasks: tuple[TestTask, ...]
 
-    def of(self, axis: str) -> tuple[TestTask, ...]:
+    def on_axis(self, axis: str) -> tuple[TestTask, ...]:
         """Return the test tasks of one axis."""
         return self._by_axis.get(axis, ())
 
     def on(self, task: Task, axis: str, same: Same = "task") -> tuple[TestTask, ...]:
         """Return the test tasks of one axis that perturb ``task``, or any task with the same scene."""
-        tests = self.of(axis)
+        tests = self.on_axis(axis)
         return tuple(tests[place] for place in self.places(task, axis, same))
 
     def places(self, task: Task, axis: str, same: Same) -> list[int]:
@@ -100,7 +100,7 @@ class TestSet:
 @cache
 def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
     """Group the indices of an axis's test tasks by the ``shared`` key of the task that they perturb."""
-    tasks = [find_task(test_task.suite, test_task.base) for test_task in test.of(axis)]
+    tasks = [find_task(test_task.suite, test_task.base) for test_task in test.on_axis(axis)]
     return grouped((shared(task, same), place) for place, task in enumerate(tasks))
 
 

@@ -24,7 +24,7 @@ LAYOUT = "<suite>/<task>_demo.hdf5, with a suite of LIBERO's or of one's own, wh
 
 
 @dataclass
-class Found:
+class CheckedDemos:
     """The result of a check.
 
     Attributes:
@@ -41,7 +41,7 @@ class Found:
     notes: list[str] = field(default_factory=list)
 
 
-def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayConfig()) -> Found:  # noqa: B008 - frozen
+def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayConfig()) -> CheckedDemos:  # noqa: B008 - frozen
     """Read every HDF5 file below a folder, and replay some demonstrations of each.
 
     A replay that misses its goal is a fault only if all replays of its file miss: a few good demonstrations miss, too.
@@ -58,7 +58,7 @@ def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayC
     files = [root / name for name in sorted(glob("**/*.hdf5", root_dir=root, recursive=True))]
     if not files:
         raise PipelineError("there is no HDF5 file", where=root, expected=LAYOUT)
-    result, jobs = Found(len(files)), []
+    result, jobs = CheckedDemos(len(files)), []
     for file in files:
         try:
             task = _task_of(file, root)
@@ -93,7 +93,7 @@ def _task_of(file: Path, root: Path) -> Task:
         raise PipelineError(error.what, where=error.where or file, expected=error.expected, remedy=remedy) from error
 
 
-_Result = tuple[Sequence[DemoEntry], Found]
+_Result = tuple[Sequence[DemoEntry], CheckedDemos]
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class _FileJob:
             faults += self._missing(missing, reasons)
         missed = [] if all_miss else [entry.demo_id for entry in missing]
         notes = [*index.notes, *_instruction_notes(self.task), *self._length_notes(index.entries)]
-        return index.entries, Found(replayed=len(chosen), faults=faults, missed=missed, notes=notes)
+        return index.entries, CheckedDemos(replayed=len(chosen), faults=faults, missed=missed, notes=notes)
 
     def _chosen(self, entries: Sequence[DemoEntry]) -> list[DemoEntry]:
         """Choose the first and the last demonstration, and further ones evenly between them."""
@@ -193,7 +193,7 @@ class _FileJob:
         return 1800.0 + 4 * 600.0 * self.replays
 
     def lost(self) -> _Result:
-        return (), Found(faults=[f"{self._file}: {LOST}, no worker reads it"])
+        return (), CheckedDemos(faults=[f"{self._file}: {LOST}, no worker reads it"])
 
 
 def _is_refused(reason: str) -> bool:

@@ -228,7 +228,9 @@ def lengths(demos: DemosConfig) -> dict[Task, list[int]]:
     steps_of = {task: source.lengths(task)[: demos.per_task] for task in select_tasks(demos.tasks)}
     if not any(steps_of.values()):
         libero_tasks = [task for task in steps_of if task.suite in SUITES]
-        steps_of = {task: [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED) for task in libero_tasks}
+        steps_of = {
+            task: [len(starter.demonstration(task).actions)] * (demos.per_task or PUBLISHED) for task in libero_tasks
+        }
     if not any(steps_of.values()):
         raise PipelineError(
             "none of your own tasks has a demonstration",

@@ -225,7 +225,7 @@ def test_nearest_knows_test_images_by_name_and_by_content() -> None:
 @pytest.mark.slow
 def test_draws_are_clear_of_the_benchmark() -> None:
     test = benchmark.load(REPOSITORY / benchmark.FOLDER)
-    shown = {other.parameters[part] for other in test.of("background") for part in ("surface", "wall")
+    shown = {other.parameters[part] for other in test.on_axis("background") for part in ("surface", "wall")
              if part in other.parameters}  # fmt: skip
     libero = {f"{name}.png".replace("cream-plaster", "cream_plaster") for name in IN_TEST_SET}
     assert libero <= shown, "images that no test task shows are shut out"

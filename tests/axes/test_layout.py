@@ -91,7 +91,7 @@ def test_added_objects_are_among_what_a_rollout_met(changed: Scene) -> None:
 
 def test_a_model_comes_twice_as_often_as_in_the_test_set() -> None:
     tested: dict[int, list[bool]] = defaultdict(list)
-    for test in benchmark.load(REPOSITORY / benchmark.FOLDER).of("layout"):
+    for test in benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis("layout"):
         names = str(test.parameters["category"]).split(",")
         tested[len(names)].append(len(set(names)) < len(names))
     for level in (1, 2, 3, 4, 5):
@@ -110,7 +110,7 @@ def test_regions_are_those_of_the_test_set() -> None:
     for arena, room in ARENAS.items():
         known = room.regions
         places: Counter[tuple[float, float]] = Counter()
-        for test in benchmark.load(REPOSITORY / benchmark.FOLDER).of("layout"):
+        for test in benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis("layout"):
             if test.parameters["arena"] == arena:
                 points = (pair.split(",") for pair in str(test.parameters["positions"]).split(";"))
                 places.update((float(x) + world_m.get(arena, 0.0), float(y)) for x, y in points)
@@ -126,7 +126,7 @@ def test_places_are_on_the_cameras_side_as_often_as_the_test_s(arena: Arena) -> 
     """At x > 0.19 m, where a place is drawn first; one that does not fit there is drawn in the other region."""
     tested = [
         float(pair.split(",")[0])
-        for test in benchmark.load(REPOSITORY / benchmark.FOLDER).of("layout")
+        for test in benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis("layout")
         if test.parameters["arena"] == arena
         for pair in str(test.parameters["positions"]).split(";")
     ]

@@ -223,7 +223,7 @@ def test_every_severity_of_a_test_task_is_the_benchmarks(
 ) -> None:
     """Frames of 256 x 256 pixels, as the benchmark's: there a scale of 1.35 or 1.5 is on the edge of a pixel more."""
     frame = make_frame(256, 256) // 2
-    tasks = [task for task in test.of("noise") if task.component == component]
+    tasks = [task for task in test.on_axis("noise") if task.component == component]
     tested = next(task for task in tasks if task.parameters["severity"] == severity)
     seen = libero_plus.noise(tested, 0).effect.apply(frame, seeding.rng(severity))
     expected = as_the_benchmark(component, TEST_GRID[component][severity - 1], frame, severity, imagemagick)
@@ -283,7 +283,9 @@ def test() -> TestSet:
 
 def test_the_parsed_severities_are_the_published_ones(test: TestSet) -> None:
     for component, published in TEST_GRID.items():
-        parsed = {int(t.parameters["severity"]): t.parameters for t in test.of("noise") if t.component == component}
+        parsed = {
+            int(t.parameters["severity"]): t.parameters for t in test.on_axis("noise") if t.component == component
+        }
         assert sorted(parsed) == list(range(1, 11))
         for severity, row in enumerate(published, 1):
             values = tuple(parsed[severity].values())[1:]

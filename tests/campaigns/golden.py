@@ -50,7 +50,7 @@ class Golden:
     def trajectories(self) -> dict[str, Trajectory]:
         """Return case to replay, for the clean case and all cases that change physics."""
         task = find_task("libero_goal", "put_the_bowl_on_the_plate")
-        demo = StarterSource().of(task)
+        demo = StarterSource().demonstration(task)
         environment = Environment(task)
         clean = replay(environment, demo, "clean", ReplayConfig())
         reference = Reference.of(clean.model_xml, clean.states, clean.actions)

@@ -193,10 +193,10 @@ LEVELS = {
 def test_every_axis_states_the_level_of_its_test_tasks() -> None:
     counts = Counter((one.axis, level_of_test(one)) for one in benchmark.load().tasks)
     assert {axis: tuple(counts[axis, level] for level in range(6)) for axis in LEVELS} == LEVELS
-    added = benchmark.load().of("layout")
+    added = benchmark.load().on_axis("layout")
     # The benchmark's names number 30 layouts of a task; six in a row add equally many objects.
     assert all(level_of_test(one) == -(-int(one.name.rpartition("_add_")[2]) // 6) for one in added)
-    assert all(f"_level{level_of_test(one)}_sample" in one.name for one in benchmark.load().of("pose"))
+    assert all(f"_level{level_of_test(one)}_sample" in one.name for one in benchmark.load().on_axis("pose"))
 
 
 def edits(one: str, other: str) -> int:
@@ -210,7 +210,7 @@ def edits(one: str, other: str) -> int:
 
 
 def test_the_level_of_a_language_test_is_its_share_of_edits() -> None:
-    for tested in benchmark.load().of("language")[::97]:
+    for tested in benchmark.load().on_axis("language")[::97]:
         text, original = (
             re.sub(r"[^a-z0-9 ]", "", text.lower())
             for text in (str(tested.parameters["text"]), find_task(tested.suite, tested.base).instruction)

@@ -65,7 +65,7 @@ def moves_of_tests_m() -> Floats:
 
 
 def of_the_task() -> list[benchmark.TestTask]:
-    return [one for one in benchmark.load(FOLDER).of("pose") if (one.suite, one.base) == (MILK.suite, MILK.name)]
+    return [one for one in benchmark.load(FOLDER).on_axis("pose") if (one.suite, one.base) == (MILK.suite, MILK.name)]
 
 
 def test_no_object_stands_where_a_test_has_it(tmp_path: Path) -> None:

@@ -102,12 +102,12 @@ def row(task: Task, perturbations: Iterable[Perturbation], name: str) -> Row:
 
 @pytest.mark.parametrize("axis", [axis for axis in AXES if axis in AS_DRAWN])
 def test_every_test_task_is_found_when_it_is_drawn(axis: str, test: TestSet) -> None:
-    known = [tested for tested in test.of(axis) if axis != "pose" or "target" in tested.parameters]
+    known = [tested for tested in test.on_axis(axis) if axis != "pose" or "target" in tested.parameters]
     assert len(known) > 600
     rows = [row(find_task(tested.suite, tested.base), [repeated(tested)], f"{n}") for n, tested in enumerate(known)]
     finding = leakage.check(rows, test)[axis]
     assert finding.overlaps == finding.rows == len(known)
-    assert finding.test_tasks == len(test.of(axis))
+    assert finding.test_tasks == len(test.on_axis(axis))
     assert finding.verdict == "overlap"
     assert finding.smallest == pytest.approx(0, abs=1e-5)
 
@@ -115,7 +115,7 @@ def test_every_test_task_is_found_when_it_is_drawn(axis: str, test: TestSet) -> 
 def test_every_test_scene_is_found_when_it_is_drawn(test: TestSet) -> None:
     """With everything that it moves; and its other moves keep it apart from a scene that only the target's fits."""
     rows = []
-    for number, tested in enumerate(test.of("pose")):
+    for number, tested in enumerate(test.on_axis("pose")):
         moves = [{"name": name, "dx_m": dx, "dy_m": dy} for name, (dx, dy) in displacements(tested.parameters).items()]
         fields = {"axis": "pose", "component": "scene", "level": 1, "moves": moves}
         rows.append(row(find_task(tested.suite, tested.base), from_json(json.dumps([fields])), f"{number}"))
@@ -168,7 +168,7 @@ def test_scenes_are_drawn_clear_of_every_test_scene_and_cover_them_all(test: Tes
     axis, rows = PoseAxis(components=("scene",)), []
     for suite in SUITES[:4]:
         for task in tasks(suite):
-            draws = islice(Draws("pose", (axis,), 5, test).of(task.name, task), 20)
+            draws = islice(Draws("pose", (axis,), 5, test).sample(task.name, task), 20)
             rows += [row(task, drawn, f"{task.name}{number}") for number, drawn in enumerate(draws)]
     finding = leakage.check(rows, test)["pose"]
     assert (finding.rows, finding.overlaps, finding.verdict) == (800, 0, "disjoint")
@@ -193,7 +193,7 @@ def test_draws_are_mostly_clear_and_the_rest_is_counted(axis: str, test: TestSet
             overlaps += perturbation.nearest(test, task).distance < perturbation.clearance
             rows.append(row(task, [perturbation], f"{suite}{variant}"))
     finding = leakage.check(rows, test)[axis]
-    assert (finding.rows, finding.overlaps, finding.test_tasks) == (160, overlaps, len(test.of(axis)))
+    assert (finding.rows, finding.overlaps, finding.test_tasks) == (160, overlaps, len(test.on_axis(axis)))
     assert finding.measure
     assert overlaps <= 16
     assert finding.not_compared == (160 if axis in ("light", "disturbance") and finding.test_tasks else 0)
@@ -216,7 +216,9 @@ def test_coverage_is_the_distance_of_test_tasks_to_what_is_wanted(test: TestSet)
     assert (found["fog"].test_tasks, found["fog"].compared, found["fog"].median) == (272, 0, None)
     assert (found["gaussian"].test_tasks, found["gaussian"].compared) == (341, 341)
     assert (found["gaussian"].smallest, found["gaussian"].largest) == (0.5, 8.5)
-    severities = [int(tested.parameters["severity"]) for tested in test.of("noise") if tested.component == "gaussian"]
+    severities = [
+        int(tested.parameters["severity"]) for tested in test.on_axis("noise") if tested.component == "gaussian"
+    ]
     away = sorted(abs(severity - 1.5) for severity in severities)
     # Places 170 and 306 of 0 to 340.
     assert (found["gaussian"].median, found["gaussian"].p90) == (away[170], away[306])
@@ -226,7 +228,7 @@ def test_coverage_is_the_distance_of_test_tasks_to_what_is_wanted(test: TestSet)
 
 
 def test_coverage_is_by_task_where_a_task_has_test_tasks_of_its_own(test: TestSet) -> None:
-    language = test.of("language")[0]
+    language = test.on_axis("language")[0]
     task = find_task(language.suite, language.base)
     (found,) = leakage.check([row(task, [repeated(language)], "one")], test)["language"].coverage.values()
     assert (found.test_tasks, found.compared, found.smallest) == (1537, len(test.on(task, "language")), 0)
@@ -252,7 +254,7 @@ def test_the_robot_axis_knows_the_benchmarks_postures(robot: str) -> None:
 
 
 def test_a_row_with_several_perturbations_counts_for_each_axis(test: TestSet) -> None:
-    language, noise = (next(iter(test.of(axis))) for axis in ("language", "noise"))
+    language, noise = (next(iter(test.on_axis(axis))) for axis in ("language", "noise"))
     task = find_task(language.suite, language.base)
     clean = row(task, [], "clean")
     both = row(task, [repeated(noise), repeated(language)], "both")
@@ -264,7 +266,7 @@ def test_a_row_with_several_perturbations_counts_for_each_axis(test: TestSet) ->
 
 
 def test_a_combination_overlaps_where_one_of_its_parts_does(test: TestSet) -> None:
-    language = test.of("language")[0]
+    language = test.on_axis("language")[0]
     task = find_task(language.suite, language.base)
     clear = NoiseAxis().sample(seeding.rng(1), task, 0)
     findings = leakage.check([row(task, [clear, repeated(language)], "both")], test)
@@ -288,9 +290,9 @@ def test_a_plan_of_another_version_is_named(test: TestSet) -> None:
 
 
 def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -> None:
-    noise = next(iter(test.of("noise")))
+    noise = next(iter(test.on_axis("noise")))
     task = find_task(noise.suite, noise.base)
-    other = next(tested for tested in test.of("noise") if tested.component != noise.component)
+    other = next(tested for tested in test.on_axis("noise") if tested.component != noise.component)
     rows = [row(task, [repeated(noise)], "one")]
     # The test set has tasks of the axis, but none to compare this with.
     assert leakage.check(rows, TestSet((other,)))["noise"].verdict == "unknown"
@@ -299,7 +301,9 @@ def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -
     assert leakage.check([], test) == {}
     severity = other.parameters["severity"]
     near = next(
-        one for one in test.of("noise") if one.component == other.component and one.parameters["severity"] != severity
+        one
+        for one in test.on_axis("noise")
+        if one.component == other.component and one.parameters["severity"] != severity
     )
     some = leakage.check([*rows, row(task, [repeated(near)], "two")], TestSet((other,)))["noise"]
     assert (some.not_compared, some.verdict) == (1, "disjoint where compared")
@@ -356,7 +360,7 @@ def test_an_overlap_is_explained_by_what_overlaps() -> None:
 
 def test_no_overlap_is_no_error(test: TestSet) -> None:
     leakage.refuse_overlap({})
-    tested = test.of("noise")[0]
+    tested = test.on_axis("noise")[0]
     findings = leakage.check([row(find_task(tested.suite, tested.base), [repeated(tested)], "planted")], test)
     with pytest.raises(PipelineError, match="such as planted"):
         leakage.refuse_overlap(findings)

@@ -21,7 +21,7 @@ STOVE = find_task("libero_goal", "turn_on_the_stove")
 def test_levels_that_are_in_the_test_set_are_named(levels: tuple[int, ...], named: str | None) -> None:
     axis = NoiseAxis.model_validate({"gaussian": ROWS, "levels": levels})
     config = PlanConfig(axes=Axes(noise=axis), episodes={"noise": 10})
-    demo = StarterSource().of(STOVE)
+    demo = StarterSource().demonstration(STOVE)
     entries, test = StarterSource().index([STOVE]).entries, benchmark.load()
     if named is None:
         assert {row.level for row in plan.make(entries, config, ReplayConfig(), test) if row.axis == "noise"} == {"5"}

@@ -55,7 +55,7 @@ def scenes_of_tests(archive: zipfile.ZipFile) -> list[Places]:
     """The places of all things in the pose tests of both tasks."""
     folder = "liberoplus/liberoplus/bddl_files/libero_spatial/"
     names = [name for task in TASKS for name in archive.namelist() if name.startswith(f"{folder}{task.name}_level")]
-    tested = {test.name for test in benchmark.load(FOLDER).of("pose")}
+    tested = {test.name for test in benchmark.load(FOLDER).on_axis("pose")}
     texts = [archive.read(name).decode() for name in names if name[len(folder) : -5] in tested]
     return [dict(named_places(text).values()) for text in texts]
 
@@ -71,7 +71,7 @@ def test_no_sample_of_a_plan_is_within_a_centimetre_of_the_other_tasks_tests(tas
     assert len(scenes) > 30
     draws = Draws("pose", (PoseAxis(levels=(1,)),), 1, benchmark.load(FOLDER))
     within = 0
-    for (drawn,) in islice(draws.of(task.name, task), 200):
+    for (drawn,) in islice(draws.sample(task.name, task), 200):
         assert isinstance(drawn, ScenePerturbation)
         places = moved_places(task, drawn.shifts)
         assert all(places.keys() == scene.keys() for scene in scenes)

@@ -71,7 +71,7 @@ def _rendered(**values: Any) -> str:
 def test_the_first_line_is_of_this_runs_demonstrations_and_axes() -> None:
     kept = [{"demo_id": name, "demo_origin": "human"} for name in ("a", "b", "b")]
     kept.append({"demo_id": "c", "demo_origin": "expanded"})
-    plots = coverage.of("camera", [], benchmark.load(REPOSITORY / benchmark.FOLDER))
+    plots = coverage.plot_axis("camera", [], benchmark.load(REPOSITORY / benchmark.FOLDER))
     shown = {axis: (plots, yields.by_level("", [])) for axis in ("camera", "disturbance")}
     text = _rendered(origins=counts.origins(kept, "hdf5"), coverage=shown)
     assert "1 expanded demonstration and 2 recorded demonstrations, replayed and perturbed on the axes camera, " in text
@@ -183,15 +183,15 @@ def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
 def test_every_axis_has_a_picture_of_where_its_draws_lie(name: str) -> None:
     task = find_task("libero_goal", "put_the_bowl_on_the_plate")
     draws = [Draw(task, _draw(name, variant), None) for variant in range(30)]
-    shown = coverage.of(name, draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
+    shown = coverage.plot_axis(name, draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert shown.panels
-    assert f"{len(benchmark.load(REPOSITORY / benchmark.FOLDER).of(name)):,}" in shown.note
+    assert f"{len(benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis(name)):,}" in shown.note
     for panel in shown.panels:
         assert panel.svg.startswith("<svg")
         assert figures.colour(name) in panel.svg or "data:image/png" in panel.svg
         assert figures.INK not in panel.svg
     # One with nothing kept, as of an axis whose replays all fail, is drawn as well.
-    assert len(coverage.of(name, [], benchmark.load(REPOSITORY / benchmark.FOLDER)).panels) == len(shown.panels)
+    assert len(coverage.plot_axis(name, [], benchmark.load(REPOSITORY / benchmark.FOLDER)).panels) == len(shown.panels)
 
 
 def test_noise_stands_between_the_benchmarks_severities() -> None:
@@ -204,7 +204,7 @@ def test_noise_stands_between_the_benchmarks_severities() -> None:
     draws = [Draw(find_task("libero_goal", "put_the_bowl_on_the_plate"), _draw("noise", n), None) for n in range(100)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coverage, "strips", strips)
-        coverage.of("noise", draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
+        coverage.plot_axis("noise", draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert set(seen) == {"motion", "gaussian", "zoom", "fog", "glass"}
     for kind, severities in seen.items():
         assert len(severities), kind

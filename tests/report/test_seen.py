@@ -46,7 +46,7 @@ def draws(name: str, axis: Axis) -> list[Perturbation]:
 @pytest.mark.parametrize("name", TOLD)
 def test_the_defaults_draw_every_kind_of_test_at_every_level(name: str, test: TestSet) -> None:
     drawn = draws(name, AXES[name]())
-    tested = {KINDS.get((name, task.component), task.component) for task in test.of(name)}
+    tested = {KINDS.get((name, task.component), task.component) for task in test.on_axis(name)}
     assert tested <= {one.component for one in drawn}
     for component in tested:
         assert {one.level for one in drawn if one.component == component} == {1, 2, 3, 4, 5}, component
@@ -132,7 +132,7 @@ def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:
         quality=Quality(**dict.fromkeys((each.name for each in fields(Quality)), 0)),
     )
     FrameStore(config.data / "frames", config.render).save(rows[0].trajectory_id, rendered, "a GPU")
-    ((_, levels),) = seen._Seen(Run(config), {rows[0].episode_id: rows[0]}).of(rows[1])
+    ((_, levels),) = seen._Seen(Run(config), {rows[0].episode_id: rows[0]}).measure(rows[1])
     assert levels == pytest.approx(20, abs=1)
 
 

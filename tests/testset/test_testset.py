@@ -62,9 +62,9 @@ def test_counts_are_those_of_the_paper(test: TestSet) -> None:
         for kind, row in COUNTS.items()
         for suite, count in zip(benchmark.TESTED_SUITES, row, strict=True)
     }
-    assert len({task.parameters["id"] for task in test.of("robot")}) == 450
-    assert len({(task.parameters["prefix"], task.parameters["number"]) for task in test.of("light")}) == 998
-    assert len({(task.suite, task.base, task.parameters["text"]) for task in test.of("language")}) == 1509
+    assert len({task.parameters["id"] for task in test.on_axis("robot")}) == 450
+    assert len({(task.parameters["prefix"], task.parameters["number"]) for task in test.on_axis("light")}) == 998
+    assert len({(task.suite, task.base, task.parameters["text"]) for task in test.on_axis("language")}) == 1509
     bases = Counter((task.suite, task.base) for task in test.tasks)
     assert len(bases) == 40
     assert (min(bases.values()), max(bases.values())) == (156, 324)
@@ -72,7 +72,7 @@ def test_counts_are_those_of_the_paper(test: TestSet) -> None:
 
 def test_parameters_are_those_the_benchmark_was_measured_to_have(test: TestSet) -> None:
     """Figures that were counted independently of this parser."""
-    cameras = {tuple(task.parameters.values()): task for task in test.of("camera")}.values()
+    cameras = {tuple(task.parameters.values()): task for task in test.on_axis("camera")}.values()
     spherical = [task.parameters for task in cameras if task.component == "spherical"]
     assert len(spherical) == 277
     assert Counter(p["elevation_deg"] for p in spherical) == {15: 149, 0: 128}
@@ -84,23 +84,23 @@ def test_parameters_are_those_the_benchmark_was_measured_to_have(test: TestSet) 
     }
     assert turns == {2, 4, 6, 8, 10}
 
-    severities = Counter((task.component, task.parameters["severity"]) for task in test.of("noise"))
+    severities = Counter((task.component, task.parameters["severity"]) for task in test.on_axis("noise"))
     assert [severities["zoom", s] for s in range(1, 11)] == [13, 16, 19, 24, 30, 32, 40, 40, 37, 37]
-    zooms = Counter(level_of_test(task) for task in test.of("noise") if task.component == "zoom")
+    zooms = Counter(level_of_test(task) for task in test.on_axis("noise") if task.component == "zoom")
     assert zooms == {1: 13 + 16, 2: 19 + 24, 3: 30 + 32, 4: 40 + 40, 5: 37 + 37}
 
-    assert Counter(task.parameters["prefix"] for task in test.of("light")) == {
+    assert Counter(task.parameters["prefix"] for task in test.on_axis("light")) == {
         "tabletop": 571, "floor": 297, "kitchen": 153, "liv": 99, "study": 22,
     }  # fmt: skip
 
-    backgrounds = test.of("background")
+    backgrounds = test.on_axis("background")
     assert len({task.parameters["surface"] for task in backgrounds}) == 278
     walls = {task.parameters["wall"] for task in backgrounds if task.component == "theme"}
     assert len(walls) == 30
     assert {"canvas_sky_blue.png", "stucco_wall.png", "CliffDesert006_AO_HIRES.png"} < walls
     assert all("wall" not in task.parameters for task in backgrounds if task.component == "surface")
 
-    layouts = [task.parameters for task in test.of("layout")]
+    layouts = [task.parameters for task in test.on_axis("layout")]
     assert Counter(p["count"] for p in layouts) == {1: 106, 2: 151, 3: 180, 4: 185, 5: 207}
     placed = {
         (p["arena"], *pair)
@@ -110,7 +110,7 @@ def test_parameters_are_those_the_benchmark_was_measured_to_have(test: TestSet) 
     assert len(placed) == 361
     assert len({category for _, category, _ in placed}) == 13
 
-    poses = test.of("pose")
+    poses = test.on_axis("pose")
     assert Counter(task.parameters["level"] for task in poses) == {1: 124, 2: 134, 3: 146, 4: 148, 5: 144}
     for suite, radius_m in (("libero_spatial", 0.01), ("libero_object", 0.03)):
         for task in poses:
@@ -167,7 +167,7 @@ def test_known_tasks(
     task = named(test, suite, base + change)
     assert (task.base, task.axis, task.component) == (base, axis, component)
     assert task.parameters == parameters
-    assert task in test.of(axis)
+    assert task in test.on_axis(axis)
     assert task in test.on(find_task(suite, base), axis)
 
 
@@ -177,7 +177,7 @@ def test_a_thing_moves_from_its_place_in_liberos_file_to_that_in_the_benchmarks(
         low_x, low_y, high_x, high_y = map(float, ranges.split())
         return (low_x + high_x) / 2, (low_y + high_y) / 2
 
-    moved = next(task for task in test.of("pose") if task.suite == "libero_spatial")
+    moved = next(task for task in test.on_axis("pose") if task.suite == "libero_spatial")
     with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as archive:
         theirs = archive.read(f"liberoplus/liberoplus/bddl_files/{moved.suite}/{moved.name}.bddl").decode()
     (x_m, y_m), (new_x_m, new_y_m) = map(centre_m, (find_task(moved.suite, moved.base).bddl_file.read_text(), theirs))
@@ -187,7 +187,7 @@ def test_a_thing_moves_from_its_place_in_liberos_file_to_that_in_the_benchmarks(
 
 
 def test_zoom_is_told_by_its_last_magnification_and_their_number(test: TestSet) -> None:
-    zooms = {int(t.parameters["severity"]): t.parameters for t in test.of("noise") if t.component == "zoom"}
+    zooms = {int(t.parameters["severity"]): t.parameters for t in test.on_axis("noise") if t.component == "zoom"}
     # Ranges from 1 to 1.11 and 1.56 in steps of 0.01 and 0.03; the end of the first is met by a rounding error.
     assert (zooms[1]["max_scale"], zooms[1]["copies"]) == (1.11, 12)
     assert (zooms[10]["max_scale"], zooms[10]["copies"]) == (1.54, 19)

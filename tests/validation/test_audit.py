@@ -59,7 +59,7 @@ def test() -> TestSet:
 def datasets(test: TestSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six episodes in three formats: one with a test camera, whose label hides it, one with a test instruction, and one
     whose label names a test task's noise."""
-    tested = next(one for one in test.of("camera") if one.component == "spherical")
+    tested = next(one for one in test.on_axis("camera") if one.component == "spherical")
     moved = Rotation.from_euler("z", float(tested.parameters["azimuth_deg"]), degrees=True) * Rotation.from_euler(
         "y", -float(tested.parameters["elevation_deg"]), degrees=True
     )

@@ -24,7 +24,7 @@ from pipeline.run.inputs import listing
 from pipeline.testset import benchmark
 from pipeline.types import Task, Trajectory
 from pipeline.validation import doctor
-from pipeline.validation.demonstrations import Found, check
+from pipeline.validation.demonstrations import CheckedDemos, check
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +50,14 @@ def file_of(root: Path, task: Task) -> Path:
     return root / task.suite / f"{task.name}_demo.hdf5"
 
 
-def checked(root: Path, replays: int = 0, **replay: object) -> Found:
+def checked(root: Path, replays: int = 0, **replay: object) -> CheckedDemos:
     return check(root, replays, loop, ReplayConfig.model_validate(replay))
 
 
 def test_good_files_pass_and_a_miss_beside_a_success_is_listed(good: Path) -> None:
     waiting = [f"{task.suite}/{task.name}/demo_1" for task in (BOWL, STOVE)]
-    assert checked(good, replays=2) == Found(files=2, demonstrations=4, replayed=4, missed=waiting)
-    assert checked(good, replays=1) == Found(files=2, demonstrations=4, replayed=2)
+    assert checked(good, replays=2) == CheckedDemos(files=2, demonstrations=4, replayed=4, missed=waiting)
+    assert checked(good, replays=1) == CheckedDemos(files=2, demonstrations=4, replayed=2)
 
 
 def test_a_file_of_which_all_miss_is_a_fault(root: Path) -> None:

@@ -42,7 +42,7 @@ TAKEN = (
 
 def recorded(folder: Path, gripper: float = 1.0) -> None:
     """A demonstration of LIBERO's task, with another command of the gripper at one step."""
-    demo = StarterSource().of(BOWL)
+    demo = StarterSource().demonstration(BOWL)
     actions, states = demo.actions.copy(), np.tile(demo.init_state, (len(demo.actions), 1))
     actions[5, 6] = gripper
     hdf5.write(folder, BOWL, [hdf5.Recording(actions, states, states[:, :9], "<mujoco/>", {})])
