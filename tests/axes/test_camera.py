@@ -1,7 +1,6 @@
 """Camera: the benchmark's own formulas, by an independent implementation, and clear of its test cameras."""
 
 import itertools
-import time
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -164,13 +163,10 @@ def test_levels_and_components_can_be_chosen() -> None:
 
 
 def test_default_draws_are_mostly_clear_of_every_test_camera(test_set: TestSet) -> None:
-    start = time.process_time()
     found = [p.nearest(test_set, MILK) for p in draws(CameraAxis())]
-    elapsed_ms = 1e3 * (time.process_time() - start) / len(found)
     assert {near.compared for near in found} == {len(test_set.tasks)}
     # The rest is drawn anew.
     assert np.mean([near.distance >= CameraPerturbation.clearance for near in found]) > 0.9
-    assert elapsed_ms < 1, "a plan asks this tens of thousands of times"
 
 
 @pytest.mark.parametrize("steepest_deg", [60.5, -9.5], ids=["steepest arena", "flattest arena"])
