@@ -204,14 +204,12 @@ def _export(stage: str) -> Stage:
         return all(export.untouched(dataset) for dataset in datasets)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
-    reads_rewrites = any(kind.rewrites_instructions for kind in kinds)
-    return Stage(
-        write_datasets,
-        ("filter", "export", "plan") if reads_rewrites else ("filter", "export"),
-        (INPUTS, *_OUTCOME) if reads_rewrites else _OUTCOME,
-        (*records, *(f"{registry.FAILURES}/{record}" for record in records)),
-        whole,
-    )
+    settings, files = [*_EXPORT], [*_OUTCOME]
+    if any(kind.rewrites_instructions for kind in kinds):
+        # The rewrites of a task depend on the plan's language axis and on the user's own bank.
+        settings, files = [*_EXPORT, "plan"], [INPUTS, *_OUTCOME]
+    records_of_failures = [f"{registry.FAILURES}/{record}" for record in records]
+    return Stage(write_datasets, settings, files, (*records, *records_of_failures), whole)
 
 
 def write_manifest(run: Run) -> None:
