@@ -16,7 +16,6 @@ from pipeline import gl
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import read_json, write, write_json
 from pipeline.formats import exact_statistics, registry
-from pipeline.formats.base import EXPORT
 from pipeline.formats.episodes import by_suite
 from pipeline.identity import refuse_unasked
 from pipeline.planning import leakage, plan
@@ -84,7 +83,7 @@ def write_inputs(run: Run) -> None:
 
 def _lost(run: Run) -> dict[str, list[str]]:
     """List the missing records that are no outputs for DVC, by the stage's record: not every run has these datasets."""
-    lost: dict[str, list[str]] = {stage.removeprefix(EXPORT): [] for stage in registry.EXPORT_STAGES}
+    lost: dict[str, list[str]] = {group: [] for group in registry.GROUPS}
     for dataset in (*run.formats, *run.failure_formats):
         record = dataset.record_file
         if record != dataset.stage_record and not record.exists():
@@ -186,9 +185,9 @@ def render(run: Run) -> None:
     print(f"{len(rendered)} files of frames are in {run.frames.root}")
 
 
-def _export(stage: str) -> Stage:
-    """Return the stage that writes the kept episodes in its formats."""
-    kinds = registry.formats_by(stage)
+def _export(group: str) -> Stage:
+    """Return the stage that writes the kept episodes in the formats of a group."""
+    kinds = registry.formats_in(group)
     records = [f"{kind.name}.json" for kind in kinds]
 
     def write_datasets(run: Run) -> None:
@@ -196,11 +195,11 @@ def _export(stage: str) -> Stage:
             # DVC needs the record after which the stage is named, also if the format is not requested.
             if kind is kinds[0] or kind.name in run.config.export.formats:
                 export.export_run(kind, run)
-        say_stale(stage.removeprefix(EXPORT), run)
+        say_stale(group, run)
 
     def whole(run: Run) -> bool:
         """Return whether the finished datasets have all their files, unchanged."""
-        datasets = [dataset for dataset in run.recorded_formats if dataset.stage == stage]
+        datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
         return all(export.untouched(dataset) for dataset in datasets)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
@@ -342,7 +341,7 @@ STAGES = {
         (TRAJECTORIES_TABLE, FRAMES_TABLE),
         _frames_whole,
     ),
-    **{stage: _export(stage) for stage in registry.EXPORT_STAGES},
+    **{f"export_{group}": _export(group) for group in registry.GROUPS},
     "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
     "recipe": Stage(write_recipe, ("export",), (MANIFEST, "lerobot.json", "lerobot_v21.json"), (FINETUNE,)),

@@ -59,10 +59,6 @@ class Export(Record):
         }
 
 
-EXPORT = "export_"
-"""Beginning of the names of the stages that write formats."""
-
-
 class StepSizes(NamedTuple):
     """Sizes of the parts of one step of an episode, in KB.
 
@@ -91,8 +87,8 @@ class Format(ABC, Generic[Options]):
     folder and the record in ``data/<run>``."""
     title: ClassVar[str]
     """Name for people, and the hub's tag."""
-    stage: ClassVar[str]
-    """Stage that writes the format: ``export_<name>``, or the stage of another format."""
+    group: ClassVar[str]
+    """Name of the format that is written by the same stage, ``export_<group>``; most often the format's own name."""
     rewrites_instructions: ClassVar[bool] = False
     """True if the format can store rewrites of instructions, which depend on the plan's language axis."""
     step_s: ClassVar[float]
@@ -136,7 +132,7 @@ class Format(ABC, Generic[Options]):
         """Return the record that is an output of the format's stage in DVC."""
         # One stage writes the kept episodes and the failures, of all its formats.
         data = self.data.parent if "outcome" in self.extras else self.data
-        return data / f"{self.stage.removeprefix(EXPORT)}.json"
+        return data / f"{self.group}.json"
 
     @property
     def work(self) -> Path:

@@ -23,7 +23,7 @@ class LeRobot(Format[LeRobotConfig]):
 
     name: ClassVar[Step] = "lerobot"
     title: ClassVar = "LeRobot"
-    stage: ClassVar = "export_lerobot"
+    group: ClassVar = "lerobot"
     rewrites_instructions: ClassVar = True
     step_s: ClassVar = 0.0015
     columns: ClassVar = (

@@ -26,7 +26,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
     name: ClassVar[Step] = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
-    stage: ClassVar = LeRobot.stage
+    group: ClassVar = LeRobot.group
     step_s: ClassVar = LeRobot.step_s
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
     columns: ClassVar[tuple[pa.Field, ...]] = ()

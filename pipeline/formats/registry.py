@@ -20,13 +20,13 @@ FORMATS: tuple[type[Format[Any]], ...] = (
 )
 
 
-EXPORT_STAGES = tuple(dict.fromkeys(kind.stage for kind in FORMATS))
-"""Stages that write formats, in their order."""
+GROUPS = tuple(dict.fromkeys(kind.group for kind in FORMATS))
+"""Groups of formats, in their order; one stage writes a group."""
 
 
-def formats_by(stage: str) -> list[type[Format[Any]]]:
-    """List the formats that a stage writes; the stage has the name of the first."""
-    return [kind for kind in FORMATS if kind.stage == stage]
+def formats_in(group: str) -> list[type[Format[Any]]]:
+    """List the formats of a group, which has the name of the first."""
+    return [kind for kind in FORMATS if kind.group == group]
 
 
 def formats_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:

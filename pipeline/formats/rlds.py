@@ -25,7 +25,7 @@ class Rlds(Format[RldsConfig]):
 
     name: ClassVar[Step] = "rlds"
     title: ClassVar = "RLDS"
-    stage: ClassVar = "export_rlds"
+    group: ClassVar = "rlds"
     step_s: ClassVar = 0.0004
     columns: ClassVar = (
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.files import remove
-from pipeline.formats.base import EXPORT
-from pipeline.formats.registry import EXPORT_STAGES, FAILURES, formats_by
+from pipeline.formats.registry import FAILURES, GROUPS, formats_in
 from pipeline.run.claim import locked, refuse_unmarked
 from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.layout import (
@@ -43,20 +42,20 @@ class Part(NamedTuple):
     made_by: str
 
 
-def _datasets(stage: str) -> Part:
-    """Return the datasets and records that a stage writes, those of failures included."""
+def _datasets(group: str) -> Part:
+    """Return the datasets and records of a group of formats, those of failures included."""
     names: list[str] = []
-    for kind in formats_by(stage):
+    for kind in formats_in(group):
         names += [kind.name, f"{kind.name}.json"]
     of_failures = [f"{FAILURES}/{name}" for name in names]
-    return Part((*names, *of_failures), f"{stage}, from the frames")
+    return Part((*names, *of_failures), f"export_{group}, from the frames")
 
 
 PARTS = {
     "unfinished": Part((WORK,), "nothing: what stopped stages left"),
     "pictures": Part((SHEETS, PREVIEWS, REPORT), "summary and report"),
     "uploads": Part((CARD, FINETUNE), "card and recipe"),
-    **{stage.removeprefix(EXPORT): _datasets(stage) for stage in EXPORT_STAGES},
+    **{group: _datasets(group) for group in GROUPS},
     "frames": Part((FRAMES,), "render, from the trajectories: most of a run's time"),
     "trajectories": Part((TRAJECTORIES, REPLAY), "replay, from the demonstrations"),
     "tables": Part(
