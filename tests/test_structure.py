@@ -37,6 +37,7 @@ FLOORS = (
     "identity",
     "record",
     "episode_schema",
+    "config_faults",
     "export_config",
     "publish_config",
     "gl",
