@@ -62,7 +62,7 @@ def status(arguments: argparse.Namespace) -> None:
     """say how many episodes are wanted and kept, what would run and why, its disk and time; changes nothing"""
     from rich.console import Console
 
-    from pipeline.validation import status
+    from pipeline import status
 
     run = owned(arguments)
     console = Console(soft_wrap=True, highlight=False)
