@@ -19,7 +19,7 @@ from pipeline.rendering.geometry import Instances, see
 from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception
-from pipeline.types import Floats, Frame, Rendered, Task, Trajectory
+from pipeline.types import Floats, Frame, Jpeg, Rendered, Task, Trajectory
 
 
 def render(
@@ -41,7 +41,7 @@ def render(
             poses.append(instances.poses(renderer.data))
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
-    encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
+    encoded: dict[str, list[Jpeg]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}
     for changes, scene in grouped((stream.changes, stream) for stream in streams).items():
         with renderer.perturbed(changes):
