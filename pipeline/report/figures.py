@@ -56,6 +56,8 @@ DOTS_DPI = 220
 
 
 class Panel(NamedTuple):
+    """One pair of axes as an SVG picture, with its title."""
+
     title: str
     svg: str
 
