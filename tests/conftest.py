@@ -31,7 +31,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.machine_code import SETTINGS
+from pipeline.machine_code import MACHINE_CODE_VARIABLES
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -75,7 +75,7 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 def pytest_configure() -> None:
     """Stop without the fixed machine code: a program that a test calls would replace the tests' process."""
-    if not SETTINGS.items() <= os.environ.items():
+    if not MACHINE_CODE_VARIABLES.items() <= os.environ.items():
         raise pytest.UsageError("pytest-env has not set the machine code of pyproject.toml: run `bash setup.sh`")
 
 

@@ -70,7 +70,7 @@ class Stage:
         changes = () if perturbation is None else (perturbation,)
         scene = self.scene
         for physics in of_layer(changes, PhysicsPerturbation):
-            scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
+            scene = physics.apply(scene, self.demo, partial(roll_out, replay_config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
         push = scene.push
         if push is None:

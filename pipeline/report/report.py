@@ -94,7 +94,7 @@ def page(run: Run, test: TestSet) -> str:
         previews={folder.name: _pictures(folder) for folder in sorted(run.path(PREVIEWS).glob("*"))},
         versions=_versions(rows),
         example=min(row["episode_id"] for row in kept),
-        settings=_settings(config),
+        settings=_dumped(config),
     )
 
 
@@ -248,16 +248,16 @@ def _versions(rows: Rows) -> dict[str, str]:
     return {**manifest.made_with(rows[0]), "rendered by": "; ".join(devices), "seed": ", ".join(seeds)}
 
 
-class _Settings(yaml.SafeDumper):
+class _ConfigDumper(yaml.SafeDumper):
     """A YAML dumper that writes only the last name of an absolute path, because the page may be published."""
 
 
-_Settings.add_multi_representer(
+_ConfigDumper.add_multi_representer(
     Path, lambda dumper, path: dumper.represent_str(path.name if path.is_absolute() else path.as_posix())
 )
 
 
-def _settings(config: Config) -> str:
+def _dumped(config: Config) -> str:
     # The place of computation changes no result, and would make the pages differ.
     chosen = config.model_dump(exclude_defaults=True, exclude={"compute", "folder"})
-    return yaml.dump(chosen, Dumper=_Settings, sort_keys=False)
+    return yaml.dump(chosen, Dumper=_ConfigDumper, sort_keys=False)

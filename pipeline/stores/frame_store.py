@@ -51,7 +51,7 @@ class FrameStore(Store):
     ``streams`` (ids of the rendered streams) and ``rejected`` (JSON, id of each rejected stream to the reason). A
     file's name is ``<trajectory id>/<digest of its streams>``.
 
-    Frames that were encoded with another ``config`` count as missing.
+    Frames that were encoded with another ``render_config`` count as missing.
     """
 
     step, stage, pattern = "encoding", "render", f"*/*{SUFFIX}"
@@ -63,10 +63,10 @@ class FrameStore(Store):
         "rejected": pa.string(),
     }
 
-    def __init__(self, root: Path, config: RenderConfig):
+    def __init__(self, root: Path, render_config: RenderConfig):
         schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*config.extras} else {}
-        super().__init__(root, config.model_dump(mode="json"), {"episode schema": schema, **maps})
+        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*render_config.extras} else {}
+        super().__init__(root, render_config.model_dump(mode="json"), {"episode schema": schema, **maps})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
