@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +15,7 @@ from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank
 from pipeline.catalogue import object_sources, texture_sources
 from pipeline.compute_config import ComputeConfig
+from pipeline.config_faults import describe
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, LONGEST_NAME, Count, ExportConfig, known_to_oft
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
@@ -339,12 +339,9 @@ def load(path: Path) -> Config:
     except (yaml.YAMLError, RecursionError) as error:
         raise PipelineError(f"not valid YAML: {error}", where=path, expected="a file like those of configs/") from error
     except ValidationError as error:
-        faults = []
-        for fault in error.errors():
-            field = ".".join(map(str, fault["loc"])) or "top level"
-            faults.append(f"{field}: {fault['msg']} (got {reprlib.repr(fault['input'])})")
+        faults = "\n    ".join(describe(error, Config))
         raise PipelineError(
-            "the configuration is not valid:\n    " + "\n    ".join(faults),
+            f"the configuration is not valid:\n    {faults}",
             where=path,
-            expected="the fields and ranges of schemas/config.schema.json",
+            remedy="look up the fields in docs/configuration.md",
         ) from error

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from command_words import parse
 from conftest import REPOSITORY
-
-from pipeline.commands.command_line import parser
 
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md")])
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -60,4 +59,4 @@ def test_the_command_line_takes_the_commands_of_the_pages(monkeypatch: pytest.Mo
     given = list(commands())
     assert len(given) >= 15
     for _, arguments in given:
-        parser().parse_args(arguments)
+        parse(arguments)

@@ -52,7 +52,7 @@ class Selection(Frozen, use_attribute_docstrings=True):
     asked for another object of their scene (``goals``); for every two axes LIBERO's task, a held-out perturbation on
     either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
-    """list of tasks that ``analyse construct`` wrote, in place of a source"""
+    """list of tasks that ``analyze construct`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES
     """only these suites"""
     axes: tuple[str, ...] = ()
@@ -274,8 +274,8 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
             f"{counts} of {len(wanted)} tasks need files of LIBERO-Plus's asset archive",
             where="axes" if archive is None else archive,
             expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}, or 62 of background in libero_object",
-            remedy=f"name the unpacked archive: --assets DIR; or --axis {' '.join(libero_plus.RUNNABLE)}; or held-out "
-            "perturbations on the same axes: --source own",
+            remedy=f"name the unpacked archive: --assets DIR; or --axis {' --axis '.join(libero_plus.RUNNABLE)}; or "
+            "held-out perturbations on the same axes: --source own",
         )
     if missing:
         print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")

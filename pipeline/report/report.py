@@ -23,7 +23,7 @@ from pipeline.report import coverage, figures, pages, seen, yields
 from pipeline.report.coverage import AxisPlots, Draw
 from pipeline.report.figures import Panel
 from pipeline.report.pages import Clip
-from pipeline.report.sheets import describe
+from pipeline.report.sheets import describe_all, name_episode
 from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
 from pipeline.run.counts import Counts, Rows, by_axis
@@ -176,7 +176,7 @@ def _worst(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
     row_of_trajectory = {row["trajectory_id"]: row for row in paired}
     moving = [row for row in row_of_trajectory.values() if row["non_target_moved_m"]]
     worst = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
-    return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in worst]
+    return [_video(row, load, f"{name_episode(row)}: {100 * row['non_target_moved_m']:.1f} cm") for row in worst]
 
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
@@ -220,7 +220,7 @@ def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
         visible = [row for row in paired if _agent_view(row) != _agent_view(twins[row["twin_id"]])]
         if visible:
             row = min(visible, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
-            caption = "; ".join(describe(made) for made in from_json(row["perturbations"]))
+            caption = f"{name_episode(row)}: {describe_all(from_json(row['perturbations']))}"
             videos.append(_video(row, load, caption))
     return videos
 

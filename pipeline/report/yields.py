@@ -50,7 +50,7 @@ def wanted_and_kept(targets: Mapping[str, Target]) -> Table:
 def by_suite(tried: Rows) -> Table:
     """Tabulate yields by axis and suite, with totals."""
     suites = named(tried, "suite")
-    head = ("axis", *(suite.removeprefix("libero_") for suite in suites), "all")
+    head = ("axis", *suites, "all")
     lines: list[tuple[str, dict[str, str]]] = [(axis, {"axis": axis}) for axis in named(tried, "axis")]
     body: list[tuple[Cell, ...]] = []
     for name, of in (*lines, ("all", {})):

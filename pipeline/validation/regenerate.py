@@ -1,6 +1,6 @@
 """Rebuilding of one episode from its row of the manifest and the demonstration, and comparison with the dataset.
 
-`python -m pipeline regenerate EPISODE_ID CONFIG --out FOLDER`
+`python -m pipeline dataset regenerate EPISODE_ID CONFIG --out FOLDER`
 """
 
 from collections.abc import Mapping

@@ -218,7 +218,7 @@ def test_bad_actions_are_refused(evaluated: EpisodeEnvironment, action: Any, mes
 
 
 def command(out: Path, *arguments: str) -> list[str]:
-    shared = ["--suite", "libero_goal", "libero_object", "--task", "turn_on*", "pick_up_the_milk*"]
+    shared = ["--suite", "libero_goal", "--suite", "libero_object", "--task", "turn_on*", "--task", "pick_up_the_milk*"]
     start = ["--initial-states", "demonstration"]
     return [sys.executable, "-m", "pipeline", "evaluate", str(out), *shared, *start, *arguments]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from conftest import STOVE
-from episode_results import analyse, result
+from episode_results import analyze, result
 
 from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.errors import PipelineError
@@ -35,7 +35,7 @@ def test_tasks_are_graded_by_the_models_that_solve_them(tmp_path: Path) -> None:
         for place, task in enumerate(tasks[: 9 if model == 0 else 10]):
             EpisodeFiles(tmp_path / str(model)).save(result(task, place > 2 * model))
     graded = tmp_path / "graded.json"
-    assert analyse("grade", *(str(tmp_path / str(model)) for model in range(4)), "--out", str(graded)) == 0
+    assert analyze("grade", *(str(tmp_path / str(model)) for model in range(4)), "--out", str(graded)) == 0
     content = json.loads(graded.read_text())
     expected = {task.name: 5 - sum(place > 2 * model for model in range(4)) for place, task in enumerate(tasks[:9])}
     assert {task["name"]: task["difficulty"] for task in content["tasks"]} == expected
@@ -47,7 +47,7 @@ def test_a_graded_task_keeps_its_name_where_another_component_was_drawn(tmp_path
     (other,) = {"controller_posture", "initial_joints"} - {task.component}
     EpisodeFiles(tmp_path).save(result(replace(task, component=other), True))
     graded = tmp_path / "graded.json"
-    assert analyse("grade", str(tmp_path), "--out", str(graded)) == 0
+    assert analyze("grade", str(tmp_path), "--out", str(graded)) == 0
     assert select(Selection(file=graded)) == [task]
 
 

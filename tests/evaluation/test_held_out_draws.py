@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import STOVE
-from episode_results import analyse, result
+from episode_results import analyze, result
 
 from pipeline.axes import Perturbation, to_json
 from pipeline.axes.camera import CameraPerturbation
@@ -69,11 +69,11 @@ def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFix
     file = tmp_path / "mine" / "plan.parquet"
     file.parent.mkdir()
     plan.write([planned_row(tasks[0], draw(tasks[0], 0))], file)
-    assert analyse("leakage", str(tmp_path), str(config)) == 1
+    assert analyze("leakage", str(tmp_path), str(config)) == 1
     printed = json.loads(capsys.readouterr().out)
     assert (printed["robot"]["overlaps"], printed["light"]["overlaps"]) == (1, 0)
     plan.write([planned_row(tasks[0], draw(tasks[0], 1))], file)
-    assert analyse("leakage", str(tmp_path), str(config)) == 0
+    assert analyze("leakage", str(tmp_path), str(config)) == 0
 
 
 def test_language_has_no_held_out_draws_and_says_what_else_there_is() -> None:

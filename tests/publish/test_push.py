@@ -351,7 +351,7 @@ def test_the_command_says_all_of_it_and_sends_it_when_asked(hub: Hub, data: Path
     environment = {**os.environ, "HF_ENDPOINT": hub.endpoint, "HF_HUB_DISABLE_XET": "1"}
 
     def push(*options: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "pipeline", "push", "lerobot", REPOSITORY, str(config), *options]
+        command = [sys.executable, "-m", "pipeline", "dataset", "push", "lerobot", REPOSITORY, str(config), *options]
         return subprocess.run(command, cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=False)
 
     told = push()

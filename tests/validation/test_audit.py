@@ -209,7 +209,7 @@ def test_a_pose_is_read_back_as_the_change_that_made_it(arena: Arena) -> None:
 def test_the_command_ends_with_1_where_something_overlaps(
     datasets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["pipeline", "audit", str(datasets / "rlds")])
+    monkeypatch.setattr(sys, "argv", ["pipeline", "dataset", "audit", str(datasets / "rlds")])
     assert main() == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["axes"]["camera"]["overlaps"] == 1

@@ -167,15 +167,12 @@ def test_memory_is_counted_for_the_workers_that_are_asked_for(
     assert doctor._machine(ComputeConfig(workers=5)).remedy == "set compute.workers to 4"
 
 
-def test_the_configuration_that_params_name_is_looked_at(
+def test_the_command_names_demonstrations_that_are_not_there(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "params.yaml").write_text("run: full\ndata: data\n")
-    (tmp_path / "configs").symlink_to(REPOSITORY / "configs")
-    monkeypatch.setattr(sys, "argv", ["pipeline", "doctor"])
+    monkeypatch.setattr(sys, "argv", ["pipeline", "doctor", str(REPOSITORY / "configs" / "full.yaml")])
     assert command_line.main() == 1
-    # The demonstrations of configs/full.yaml are not in this folder.
     assert "data/demos" in capsys.readouterr().err
 
 
