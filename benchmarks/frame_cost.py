@@ -28,7 +28,7 @@ from replayed_twin import replayed_twin
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode, to_policy
-from pipeline.machine_code import SETTINGS, ensure_fixed_machine_code
+from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_code
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame, Trajectory
@@ -107,5 +107,5 @@ def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool, dr
 
 
 if __name__ == "__main__":
-    ensure_fixed_machine_code(SETTINGS | {"LP_NUM_THREADS": "1"})
+    ensure_fixed_machine_code(MACHINE_CODE_VARIABLES | {"LP_NUM_THREADS": "1"})
     main()

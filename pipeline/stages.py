@@ -47,6 +47,9 @@ from pipeline.run.run import Run
 from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.testset import benchmark
 
+EVERY_TIME = "it runs every time"
+"""Reason of a stage without outputs of its own, which decides itself if work is left."""
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -379,21 +382,27 @@ def perform(name: str, run: Run, title: str = "") -> None:
     Raises:
         PipelineError: when the stage stops.
     """
-    stage = STAGES[name]
-    memory = _memory(name, run)
-    whole = stage.whole is None or stage.whole(run)
-    reason = None if memory is None else memory.why_not()
-    if whole and memory is not None and reason is None:
+    reason = why_not(name, run)
+    if reason is None:
         print(f"{title or name}: up to date", flush=True)
         return
     print(title or name, flush=True)
-    if reason not in (None, finished.NO_RECORD):
+    if reason not in (EVERY_TIME, finished.NO_RECORD):
         print(f"  changed since the last call: {reason}", flush=True)
     refuse_foreign_files(run.folder)
-    stage.work(run)
+    STAGES[name].work(run)
     after = _memory(name, Run(run.config))
     if after is not None:
         after.keep()
+
+
+def why_not(name: str, run: Run) -> str | None:
+    """Describe why a stage has to work; `None` if its outputs are up to date."""
+    memory, whole = _memory(name, run), STAGES[name].whole
+    reason = EVERY_TIME if memory is None else memory.why_not()
+    if reason is None and whole is not None and not whole(run):
+        return "a stored file is missing or has changed"
+    return reason
 
 
 def _memory(name: str, run: Run) -> Memory | None:

@@ -24,7 +24,7 @@ from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
-from pipeline.types import Episode, Extra, Geometry
+from pipeline.types import Episode, Extra, Geometry, Jpeg
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
@@ -45,10 +45,10 @@ def episode(episode_id: str) -> Episode:
     noise = rng.integers(0, 256, (256, 256, 3), np.uint8)
     background = cv2.convertScaleAbs(cv2.GaussianBlur(noise, (0, 0), 12), alpha=6, beta=-640)
 
-    def frame(t: int, gray: int) -> bytes:
+    def frame(t: int, gray: int) -> Jpeg:
         canvas = background.copy()
         cv2.circle(canvas, (40 + 8 * t, 120 + 3 * t), 24, (gray, 120, 90), -1, cv2.LINE_AA)
-        return cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        return Jpeg(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
 
     def matrix(size: int) -> NDArray[np.float32]:
         return rng.normal(size=(size, size)).astype(np.float32)

@@ -259,18 +259,18 @@ def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvi
 
 
 @lru_cache(maxsize=1)
-def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
+def _policy(policy_config: PolicyConfig, identity: str, look_every: int) -> Policy:
     """Return this process's policy.
 
     Raises:
         PipelineError: if it is not the policy with which the evaluation began.
     """
-    policy = config.open(look_every)
+    policy = policy_config.open(look_every)
     # The identity is computed after loading: files that changed before they were loaded still differ now.
-    if config.identity() != identity:
+    if policy_config.identity() != identity:
         raise PipelineError(
             "the checkpoint has changed since the evaluation began",
-            where=config.address,
+            where=policy_config.address,
             expected="one policy for the whole evaluation, such as a folder that no training writes into",
             remedy="run the same command again",
         )

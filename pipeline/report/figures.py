@@ -7,6 +7,7 @@ page's text, so that a figure can be read on light and on dark pages.
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -55,6 +56,8 @@ DOTS_DPI = 220
 
 
 class Panel(NamedTuple):
+    """One pair of axes as an SVG picture, with its title."""
+
     title: str
     svg: str
 
@@ -145,7 +148,7 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
         axes.set_yticks(range(len(rows)), [name.replace("+", "+\n") for name in rows])
         axes.set(xlabel=label, ylim=(len(rows) - 0.5, -0.5))
         axes.grid(visible=False, axis="y")
-        plotted = np.concatenate([values for groups in rows.values() for values in groups.values()])
+        plotted = np.concatenate(list(chain.from_iterable(groups.values() for groups in rows.values())))
         axes.xaxis.set_major_locator(
             MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((plotted == plotted.round()).all()))
         )

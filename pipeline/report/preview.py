@@ -7,7 +7,7 @@ are the ones that a plan with the same seed samples for the demonstration.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 from PIL import Image
@@ -70,7 +70,7 @@ class Stage:
         changes = () if perturbation is None else (perturbation,)
         scene = self.scene
         for physics in of_layer(changes, PhysicsPerturbation):
-            scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
+            scene = physics.apply(scene, self.demo, partial(roll_out, replay_config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
         push = scene.push
         if push is None:
@@ -192,7 +192,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
     if not drawn:
         tiles.append(_nothing_drawn(name, tiles[0].picture.size))
-    strips = [tile for push in drawn for tile in _strip(stage, push)]
+    strips = list(chain.from_iterable(_strip(stage, perturbation) for perturbation in drawn))
     if strips:
         tiles, drawn, views = strips, [], ["image"]
     for perturbation in drawn:

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -224,7 +225,7 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
         rewrites = [LanguagePerturbation(component="paraphrase", level=1, text=text)]
     if task is None:
         # Without a task, the episode is compared with the task whose test instructions are nearest.
-        every = [task for suite in TESTED_SUITES for task in tasks(suite)]
+        every = list(chain.from_iterable(map(tasks, TESTED_SUITES)))
         task = min(every, key=lambda task: rewrites[0].nearest(test, task).distance) if rewrites else every[0]
     return Compared(episode.episode_id, task.suite, task.name, to_json([*perturbations, *rewrites]))
 
@@ -257,7 +258,7 @@ def _tasks_by_text() -> dict[str, Task]:
     bank = load_bank()
     for suite in TESTED_SUITES:
         for task in tasks(suite):
-            rewrites = [text for texts in bank.get(suite, {}).get(task.name, {}).values() for text in texts]
+            rewrites = chain.from_iterable(bank.get(suite, {}).get(task.name, {}).values())
             for text in (*rewrites, task.instruction):
                 by_text[normalise(text)] = task
     return by_text

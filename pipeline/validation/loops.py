@@ -1,6 +1,7 @@
-"""Compilation of all Numba loops that a run uses, robosuite's and ours: python -m pipeline.validation.loops
+"""Compilation of all Numba loops that a run uses, robosuite's and ours.
 
-``setup.sh`` runs it once. Otherwise the processes that first need a loop compile it, several at a time.
+``setup.sh`` calls ``python -m pipeline.validation.loops`` once. Otherwise the processes that first need a loop
+compile it, several at a time.
 """
 
 import numpy as np

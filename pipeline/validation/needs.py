@@ -12,7 +12,8 @@ less time than estimated.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,8 +74,8 @@ def needed_mb(config: Config) -> dict[str, float]:
     for number, kinds in _planned(config.plan):
         physics = any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         trajectories += number * (1 + config.plan.reserve) * physics
-        frames += number * len({view for kind in kinds for view in kind.views})
-        maps += number * len({view for kind in kinds if _seen_otherwise(kind) for view in kind.views})
+        frames += number * _changed_views(kinds)
+        maps += number * _changed_views([kind for kind in kinds if _seen_otherwise(kind)])
     frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
     map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
     poses_kb = POSES_KB if "object_poses" in extras else 0.0
@@ -194,6 +195,11 @@ def _planned(plan: PlanConfig) -> Iterator[tuple[int, list[type[Perturbation]]]]
     """Yield, for each combination of axes, its wanted number of episodes, and the classes of its perturbations."""
     for name, episodes in plan.episodes.items():
         yield episodes, [AXES[axis].draws[0] for axis in axes_of(name)]
+
+
+def _changed_views(kinds: Iterable[type[Perturbation]]) -> int:
+    """Count the views that show at least one of the perturbations."""
+    return len(set(chain.from_iterable(kind.views for kind in kinds)))
 
 
 def _casts_shadows(kind: type[Perturbation]) -> bool:

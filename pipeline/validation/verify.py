@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 from pipeline.compute.pool import Workers
@@ -91,4 +92,4 @@ def _damaged(store: Store, file: str) -> list[str]:
 def _result(findings: Iterable[Sequence[str]]) -> dict[str, Any]:
     """Summarize the findings of each checked file."""
     of_files = list(findings)
-    return {"checked": len(of_files), "damaged": [finding for of_file in of_files for finding in of_file]}
+    return {"checked": len(of_files), "damaged": list(chain.from_iterable(of_files))}

@@ -144,7 +144,7 @@ def configured(clone: Path, **sections: Any) -> None:
     file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
 
 
-def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
+def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path, short_demos: Path) -> None:
     def would_run() -> list[str]:
         done = call(clone, "status", "configs/tiny.yaml")
         assert done.returncode == 0, done.stderr
@@ -168,14 +168,19 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     assert would_run() == ["card"]
     assert "render 0 s, export 0 s, validate 0 s" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / "card").rename(clone / "data/tiny/card")
-    listed = clone / "data/tiny/inputs.json"
-    before_edit = listed.read_text()
-    listed.write_text(json.dumps(json.loads(before_edit) | {"demos.root/another": [1, 2]}))
+    (clone / "data/tiny/leakage.json").write_text("{}")
+    assert would_run() == ["leakage", "card", "report"]
+    assert "leakage: leakage.json is missing or has changed" in call(clone, "status", "configs/tiny.yaml").stdout
+    shutil.copy(finished / "leakage.json", clone / "data/tiny/leakage.json")
+    demos = tiny_config(shutil.copytree(short_demos, clone / short_demos.name))["demos"]
+    configured(clone, demos=demos)
+    assert would_run() == [], "the place of the demonstrations changes nothing"
+    (clone / short_demos.name / "another").write_text("")
     assert would_run() == ["plan", "exports and all that follows"]
-    assert "files that it names (1, such as demos.root/another)" in call(clone, "status", "configs/tiny.yaml").stdout
-    listed.write_text(before_edit)
+    assert "plan: other demos.root/another" in call(clone, "status", "configs/tiny.yaml").stdout
+    (clone / short_demos.name / "another").unlink()
     configured(clone, export={"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 2}})
-    assert would_run() == ["export_rlds", "manifest and all that follows"]
+    assert would_run() == ["doctor", "export_rlds", "manifest and all that follows"]
     configured(clone, export=tiny_config(clone)["export"])
     rendered, *others = sorted((clone / "data/tiny/frames").glob("*/"))
     shutil.rmtree(rendered)
@@ -183,7 +188,7 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     (clone / "data/tiny/trajectories" / f"{others[0].name}.npz").unlink()
     assert would_run() == ["replay", "render", "exports and all that follows"]
     configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
-    assert "plan: another configuration: plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "plan: other plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / "data/tiny/plan.parquet").unlink()
     told = call(clone, "status", "configs/tiny.yaml").stdout
     assert "  plan: " in told

@@ -35,6 +35,8 @@ def psnr_db(a: NDArray[Any], b: NDArray[Any]) -> float:
 
 @dataclass(frozen=True)
 class Written:
+    """The datasets of six episodes in each format."""
+
     rlds: Rlds
     lerobot: LeRobot
     images: LeRobot

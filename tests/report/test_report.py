@@ -31,7 +31,7 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.run import Run
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
-from pipeline.types import Quality
+from pipeline.types import Jpeg, Quality
 
 LIMIT_BYTES = 15_000_000
 
@@ -241,7 +241,7 @@ def _content(address: str) -> bytes:
     return base64.b64decode(address.partition(",")[2])
 
 
-def _still(frame: NDArray[np.uint8]) -> bytes:
+def _still(frame: NDArray[np.uint8]) -> Jpeg:
     return encode(frame, RenderConfig())
 
 

@@ -1,13 +1,14 @@
 """What the experiment's tables say: rows as they were written, paired differences, exact p-values, and the pages."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import comparison
 import numpy as np
 import pytest
+import results
 from conftest import REPOSITORY
 from episode_results import result
 from scipy.stats import permutation_test
@@ -16,11 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 
-EFFECT = REPOSITORY / "benchmarks" / "effect"
-sys.path.append(str(EFFECT))
-
-import comparison  # noqa: E402
-import results  # noqa: E402
+EFFECT = Path(__file__).parent
 
 
 def row(axis: str, number: int, success: bool, policy: str) -> EpisodeResult:
