@@ -20,7 +20,6 @@ import tensorflow_datasets as tfds
 
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
-from pipeline.axes.camera_pose import moved_to
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
@@ -35,6 +34,7 @@ from pipeline.planning.leakage import check as compare
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TESTED_SUITES, TestSet
 from pipeline.types import Floats, Task
+from pipeline.validation.camera_pose import moved_to
 
 LABELS = ("suite", "task", "perturbations")
 
