@@ -14,11 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Measures, ObservedEpisode, Plot, Strips
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
@@ -141,6 +142,10 @@ class Perturbation(Frozen):
         """List the shown textures and objects that have a licence of their own."""
         return frozenset()
 
+    def observe(self, episode: ObservedEpisode) -> Measures:
+        """Measure what a policy sees of this change in a kept ``episode`` that has no other change."""
+        return ()
+
 
 class Axis(Frozen):
     """Ranges that an axis samples from.
@@ -219,6 +224,40 @@ class Axis(Frozen):
     def offered(self) -> dict[str, int]:
         """Count the distinct third-party things to sample from, by kind; missing sources are fetched."""
         return {}
+
+    @classmethod
+    def name(cls) -> str:
+        """Return the name of the axis, which all its perturbations have."""
+        return str(cls.draws[0].model_fields["axis"].default)
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the perturbations of kept episodes, next to the test tasks.
+
+        The default has the level and every parameter that is a number.
+        """
+        parameters = []
+        for parameter, field in cls.draws[0].model_fields.items():
+            if field.annotation in (int, float) and all(parameter in kind.model_fields for kind in cls.draws):
+                parameters.append(parameter)
+        plots: list[Plot] = []
+        for parameter in ("level", *parameters):
+            values = np.array([getattr(item.perturbation, parameter) for item in kept], float)
+            plots.append(Strips(parameter.replace("_", " "), {"draws": {cls.name(): values}}, parameter))
+        return CoveragePlots(f"{len(test.on_axis(cls.name())):,} test tasks.", plots)
+
+    @classmethod
+    def observe_tests(cls, test: TestSet) -> Measures:
+        """Measure what a policy sees of the axis in the test tasks, under the names of ``Perturbation.observe``.
+
+        Measures that need a simulator are not computed here: ``benchmarks/test_tasks_seen.py`` has stored them.
+        """
+        return ()
+
+    @classmethod
+    def observe_together(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> Measures:
+        """Measure the axis's perturbations of all kept episodes together, also of episodes with several changes."""
+        return ()
 
 
 class TextPerturbation(Perturbation):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Annotated, ClassVar, Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Intervals, PhysicsPerturbation, pick
+from pipeline.axes.report_data import ObservedEpisode
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import kept_actions
@@ -91,6 +92,13 @@ class DisturbancePerturbation(PhysicsPerturbation):
         """Return the distances (N,) to pushes that begin at the same step; NaN for pushes at another step."""
         apart_n_s = [float(np.linalg.norm(self.impulse_n_s - push.impulse_n_s)) for push in others]
         return np.where([self.first_step == push.first_step for push in others], apart_n_s, math.nan)
+
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure how far the push takes the hand off its path."""
+        end = self.first_step + self.steps
+        twin = episode.twin_look(end)
+        if twin is not None:
+            yield f"hand off its path after a push of level {self.level} (cm)", episode.look(end).moved_cm(twin)
 
 
 class DisturbanceAxis(Axis):
