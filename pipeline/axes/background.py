@@ -161,6 +161,7 @@ class BackgroundAxis(Axis):
     draws: ClassVar = (BackgroundPerturbation,)
     colour: ClassVar = "#1f9e82"
     dimension: ClassVar = "background"
+    test_scene: ClassVar = "scene files"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("theme", "surface")
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")

@@ -62,6 +62,13 @@ class Credit(NamedTuple):
     attribution: str
 
 
+TestScene = Literal["libero", "bddl", "bddl and models", "scene files"]
+"""Source of the scenes of an axis's test tasks.
+
+It is LIBERO's own task, a BDDL file of the benchmark, such a file with models of the benchmark's asset archive, or
+scene files of this archive in place of LIBERO's."""
+
+
 class Perturbation(Frozen):
     """One sampled change on one axis, with all of its parameters; pydantic reads and writes it as JSON.
 
@@ -76,6 +83,7 @@ class Perturbation(Frozen):
         clearance: least distance to any test task; a perturbation that comes closer is sampled again.
         same: the property that two changes must share to be compared: the LIBERO task or its initial scene. ``None``
             if all changes can be compared.
+        can_hide: true if it can hide the hand or the task's things from the agent view.
     """
 
     axis: str
@@ -88,6 +96,7 @@ class Perturbation(Frozen):
     unit: ClassVar[str | None] = None
     clearance: ClassVar[float] = 0.0
     same: ClassVar[Same | None] = None
+    can_hide: ClassVar[bool] = False
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the axis's test tasks, in their order, for an episode of ``task``.
@@ -142,6 +151,11 @@ class Perturbation(Frozen):
         """List the shown textures and objects that have a licence of their own."""
         return frozenset()
 
+    @property
+    def acts_until(self) -> int | None:
+        """Control step at which a change ends that acts during the episode, ``None`` for a change from the start on."""
+        return None
+
     def observe(self, episode: ObservedEpisode) -> Measures:
         """Measure what a policy sees of this change in a kept ``episode`` that has no other change."""
         return ()
@@ -154,6 +168,8 @@ class Axis(Frozen):
         draws: classes of the perturbations that it samples; the field ``component`` discriminates between them.
         colour: colour of the axis in plots.
         dimension: the paper's dimension whose test tasks this axis has; empty if the benchmark tests no such change.
+        test_name: the paper's name of these test tasks, if they are only a part of the dimension; else empty.
+        test_scene: source of the scenes of these test tasks.
         audited: part of an unlabelled data set that shows the perturbations of the axis.
         not_held_out: reason why evaluations have no held-out perturbations of this axis; empty if they have some.
         levels: strengths to sample, each with equal probability.
@@ -162,6 +178,8 @@ class Axis(Frozen):
     draws: ClassVar[tuple[type[Perturbation], ...]]
     colour: ClassVar[str] = "#a3384d"
     dimension: ClassVar[str] = ""
+    test_name: ClassVar[str] = ""
+    test_scene: ClassVar[TestScene] = "libero"
     audited: ClassVar[Literal["instructions", "cameras", "nothing"]] = "nothing"
     not_held_out: ClassVar[str] = ""
 
@@ -310,6 +328,7 @@ class RenderPerturbation(Perturbation):
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
+    can_hide: ClassVar[bool] = True
     fields: ClassVar[tuple[str, ...]] = ()
     casts_shadows: ClassVar[bool]
     paints: ClassVar[bool]

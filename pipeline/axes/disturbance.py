@@ -77,7 +77,7 @@ class DisturbancePerturbation(PhysicsPerturbation):
         ``push_at_grasp``: the gripper opens or closes within ``away_steps`` of the push.
         ``push_after_end``: the actions end within ``away_steps`` of the push, or before.
         """
-        gripper, end = actions[:, 6], self.first_step + self.steps
+        gripper, end = actions[:, 6], self.acts_until
         if end + self.away_steps > len(gripper):
             return "push_after_end"
         near = gripper[max(self.first_step - self.away_steps - 1, 0) : end + self.away_steps]
@@ -93,12 +93,16 @@ class DisturbancePerturbation(PhysicsPerturbation):
         apart_n_s = [float(np.linalg.norm(self.impulse_n_s - push.impulse_n_s)) for push in others]
         return np.where([self.first_step == push.first_step for push in others], apart_n_s, math.nan)
 
+    @property
+    def acts_until(self) -> int:
+        """Control step after the last step of the push."""
+        return self.first_step + self.steps
+
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Measure how far the push takes the hand off its path."""
-        end = self.first_step + self.steps
-        twin = episode.twin_look(end)
+        look, twin = episode.look(self.acts_until), episode.twin_look(self.acts_until)
         if twin is not None:
-            yield f"hand off its path after a push of level {self.level} (cm)", episode.look(end).moved_cm(twin)
+            yield f"hand off its path after a push of level {self.level} (cm)", look.moved_cm(twin)
 
 
 class DisturbanceAxis(Axis):

@@ -63,6 +63,7 @@ class LayoutPerturbation(PhysicsPerturbation):
 
     measure: ClassVar[str] = "infinite where no category is shared with a test task in the same scene, else 0"
     clearance: ClassVar[float] = 1.0
+    can_hide: ClassVar[bool] = True
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """Return the scene with the objects added; see ``pipeline.scenes.placement.place``."""
@@ -132,6 +133,8 @@ class LayoutAxis(Axis):
     draws: ClassVar = (LayoutPerturbation,)
     colour: ClassVar = "#7d9a1f"
     dimension: ClassVar = "layout"
+    test_name: ClassVar = "confounding objects"
+    test_scene: ClassVar = "bddl and models"
 
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
     area_m2: float = Field(default=0.12, gt=0.0, le=10.0)

@@ -158,6 +158,7 @@ class LightAxis(Axis):
     draws: ClassVar = (LightPerturbation,)
     colour: ClassVar = "#e59a00"
     dimension: ClassVar = "light"
+    test_scene: ClassVar = "scene files"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = get_args(Component)
     combined_share: float = Field(default=0.6, ge=0.0, le=1.0)

@@ -368,6 +368,8 @@ class PoseAxis(Axis):
     draws: ClassVar = (PosePerturbation, ScenePerturbation)
     colour: ClassVar = "#d463b0"
     dimension: ClassVar = "layout"
+    test_name: ClassVar = "displaced targets"
+    test_scene: ClassVar = "bddl"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("scene",)
     step_m: float = Field(default=0.016, ge=0.0001, le=0.2)
