@@ -274,7 +274,10 @@ class Axis(Frozen):
 
     @classmethod
     def observe_together(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> Measures:
-        """Measure the axis's perturbations of all kept episodes together, also of episodes with several changes."""
+        """Measure the axis's perturbations of all kept episodes together, also of episodes with several changes.
+
+        The items of ``kept`` have no ``resolved``.
+        """
         return ()
 
 
