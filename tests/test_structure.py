@@ -2,11 +2,14 @@
 
 import ast
 import re
+from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 from conftest import REPOSITORY
+
+from pipeline.axes import AXES
 
 CONTRIBUTING = REPOSITORY / "CONTRIBUTING.md"
 FLOOR = re.compile(r"^\w+( > \w+)+", re.MULTILINE)
@@ -69,3 +72,28 @@ def test_imports_run_downwards(graph: dict[str, set[str]]) -> None:
         if "pipeline" not in (module, other) and order.index(room(other)) < order.index(room(module))
     ]
     assert upwards == []
+
+
+AXIS_IS_SUBJECT = {
+    # The benchmark's files and the paper's table, which name the dimensions of the test tasks.
+    *("pipeline.testset.definitions", "pipeline.testset.own_tasks"),
+    *("pipeline.evaluation.libero_plus", "pipeline.report.evaluation_findings"),
+    # What two axes do to a scene, which sampling a plan must not load.
+    *("pipeline.scenes.placement", "pipeline.scenes.moving"),
+    # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
+    *("pipeline.formats.lerobot_columns", "pipeline.formats.lerobot_episode", "pipeline.evaluation.harness"),
+    *("pipeline.export_config", "pipeline.rendering.geometry"),
+}
+"""Modules outside of ``axes`` in which a string may be the name of an axis."""
+
+
+def axis_names(file: Path) -> Iterator[str]:
+    """Yield the strings of a file that are the name of an axis, alone or joined by +."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and {*node.value.split("+")} <= AXES.keys():
+            yield node.value
+
+
+def test_a_new_axis_is_named_in_its_own_room_alone() -> None:
+    elsewhere = {name: file for name, file in modules().items() if room(name) != "axes"}
+    assert {name for name, file in elsewhere.items() if [*axis_names(file)]} == AXIS_IS_SUBJECT

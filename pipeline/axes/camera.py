@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from pipeline.axes.base import (
     pick,
     point,
 )
+from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation, Scatter, Strips
 from pipeline.rotations import about, product, rotate
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats, Task
@@ -314,3 +316,32 @@ class CameraAxis(Axis):
                 drawn = {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
         drawn |= self.aside.draw(rng, pick(rng, ASIDES[component]))
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[CameraPerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the cameras' places, distances and turns."""
+        tested = [task.parameters for task in test.on_axis("camera")]
+        cameras = [item.perturbation for item in kept]
+
+        def points(first: str, second: str) -> dict[str, Floats]:
+            """Return distinct points (N, 2) of the test tasks, many of which share a camera, and the perturbations'."""
+            test_points = [(float(parameters[first]), float(parameters[second])) for parameters in tested]
+            read = attrgetter(first, second)
+            return {
+                BENCHMARK: np.unique(np.array(test_points).reshape(-1, 2), axis=0),
+                "camera": np.array([read(camera) for camera in cameras]).reshape(-1, 2),
+            }
+
+        scales = {
+            BENCHMARK: np.unique([float(parameters["distance_scale"]) for parameters in tested]),
+            "camera": np.array([camera.distance_scale for camera in cameras]),
+        }
+        return CoveragePlots(
+            f"{len(tested):,} test cameras. A draw is a point in each plot; what it leaves alone stays LIBERO's. Where "
+            "it lies on a test camera in one plot, it is apart from it in another.",
+            [
+                Scatter("where it stands", points("azimuth_deg", "elevation_deg"), "azimuth (°)", "elevation (°)"),
+                Strips("how far away", {"scale": scales}, "multiple of the distance"),
+                Scatter("how it is turned in place", points("yaw_deg", "pitch_deg"), "yaw (°)", "pitch (°)"),
+            ],
+        )

@@ -11,7 +11,7 @@ goal as far as ``language_goal.py`` can check.
 from __future__ import annotations
 
 import bisect
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
@@ -25,6 +25,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pipeline import seeding
 from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
 from pipeline.axes.language_lint import CLASSES, LENGTH, NAMED, REMEDY, Component, lint, normalise
+from pipeline.axes.report_data import BENCHMARK, CoveragePlots, Histogram, KeptPerturbation, ObservedEpisode, Strips
 from pipeline.errors import PipelineError
 from pipeline.jit import compiled
 from pipeline.libero.tasks import Same, find_task
@@ -67,6 +68,10 @@ class LanguagePerturbation(TextPerturbation):
         if normalise(self.text) in _all_test_wordings(test):
             return nearest._replace(distance=0.0)
         return nearest
+
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Count the words of the instruction."""
+        yield "words", len(episode.instruction.split())
 
 
 class LanguageAxis(Axis):
@@ -142,6 +147,35 @@ class LanguageAxis(Axis):
             if rewrite.nearest(test, task).distance >= rewrite.clearance:
                 texts.append(rewrite.text)
         return tuple(texts)
+
+    @classmethod
+    def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:
+        """Count the words of each test instruction."""
+        for tested in test.on_axis("language"):
+            yield "words", len(str(tested.parameters["text"]).split())
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[LanguagePerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the distances to the original wordings."""
+        tested = test.on_axis("language")
+        tested_shares = []
+        for task in tested:
+            original = find_task(task.suite, task.base).instruction
+            tested_shares.append(distance(str(task.parameters["text"]), original))
+        shares = [distance(item.perturbation.text, item.task.instruction) for item in kept]
+        rows = {}
+        for name in CLASSES:
+            of_class = [share for share, item in zip(shares, kept, strict=True) if item.perturbation.component == name]
+            rows[name.replace("_", " ")] = {"language": np.array(of_class)}
+        every = {BENCHMARK: np.array(tested_shares), "language": np.array(shares)}
+        label = "share of characters edited"
+        return CoveragePlots(
+            f"{len(tested):,} test instructions, of no stated class. The distance is the share of characters to edit.",
+            [
+                Histogram("distance to the original wording", every, np.linspace(0, 1, 21), label),
+                Strips("the same by class", rows, label),
+            ],
+        )
 
 
 @cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import ClassVar, Literal, TypeVar
 
@@ -14,6 +14,7 @@ from pydantic import model_validator
 from pipeline import seeding
 from pipeline.axes.base import LEVELS, Axis, ByLevel, PixelPerturbation, level_from, pick
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
+from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation, ObservedEpisode, Strips
 from pipeline.errors import PipelineError
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -82,6 +83,12 @@ class NoisePerturbation(PixelPerturbation):
             comparable = perturbation.component == self.component
             severities.append(perturbation.severity(test) if comparable else np.nan)
         return np.abs(np.array(severities) - self.severity(test))
+
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure the mean change of the agent view."""
+        changes = episode.changes()
+        if changes:
+            yield f"{self.component} (mean grey levels)", float(changes["image"].mean())
 
     def severity(self, test: TestSet) -> float:
         """Return the strength on the scale of the component's test severities.
@@ -189,6 +196,27 @@ class NoiseAxis(Axis):
         for component in dict.fromkeys(test.component for test in tests):
             grids[component] = tuple(effects[component, 2 * level] for level in LEVELS)
         return cls.model_validate(grids)
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[NoisePerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe a plot of the strengths of each component, on the scale of the benchmark's severities."""
+        rows = {}
+        for component in dict.fromkeys(task.component for task in test.on_axis("noise")):
+            of_component = [item.perturbation for item in kept if item.perturbation.component == component]
+            tested = [task.parameters for task in test.on_axis("noise") if task.component == component]
+            severities: Floats = np.unique([float(parameters["severity"]) for parameters in tested])
+            at = np.array([])
+            if of_component:
+                name, clean = of_component[0].effect.strength
+                ladder = sorted({(float(parameters["severity"]), float(parameters[name])) for parameters in tested})
+                steps, values = np.array([(0.0, float(clean)), *ladder]).T
+                at = np.interp([float(getattr(p.effect, name)) for p in of_component], values, steps)
+            rows[component] = {BENCHMARK: severities, "noise": at}
+        return CoveragePlots(
+            f"{len(test.on_axis('noise')):,} test tasks at ten severities of each kind; a draw stands where its "
+            "strength would, on the benchmark's scale.",
+            [Strips("strength by kind", rows, "severity")],
+        )
 
 
 def effect_of(test: TestTask) -> dict[str, Value]:

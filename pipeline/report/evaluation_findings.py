@@ -124,9 +124,6 @@ COLUMNS = {
 }
 """The paper's dimensions to this project's axes."""
 
-NAMES = {("layout", "objects"): "confounding objects", ("pose", "pose"): "displaced targets"}
-"""Names of the paper for the two components of its layout."""
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -247,7 +244,8 @@ def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
         partly = any(stratum[:2] == kind for stratum in run)
         which = f" level {' and '.join(map(str, levels))}" if partly else ""
         count = sum(sizes[(*kind, level)] for level in levels)
-        descriptions.append(f"{NAMES.get(kind, kind[1])}{which} ({count:,} tasks)")
+        axis, component = kind
+        descriptions.append(f"{AXES[axis].test_name or component}{which} ({count:,} tasks)")
     axes_run = {axis for axis, *_ in run}
     suites = {suite for axis, _, _, suite in _tests() if axis in axes_run}
     return ", ".join([*descriptions, *sorted(suites - {row.suite for row in rows})])

@@ -16,15 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
-from numpy.typing import NDArray
 
 from pipeline.axes import AXES
+from pipeline.axes.report_data import REFERENCES, Bars, Groups, Histogram, Plot, Scatter, Strips, Values
 
-Values = NDArray[Any]
-Groups = Mapping[str, Values]
-"""Values plotted in one colour, by name; groups in ``REFERENCES`` are plotted behind the others, in grey."""
-
-REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
 COLOURS = {name: axis.colour for name, axis in AXES.items()}
 OTHER = "#b0794a"
@@ -81,6 +76,19 @@ def panel(title: str, plot: Callable[[Axes], None], height_in: float = HEIGHT_IN
     # HTML knows the namespaces, and numbered names would clash between the figures of a page.
     plotted = re.sub(r' xmlns(:xlink)?="[^"]*"| id="[a-z0-9_.]+_\d+"', "", plotted)
     return Panel(title, plotted.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1))
+
+
+def plot(described: Plot) -> Panel:
+    """Plot what an axis describes."""
+    match described:
+        case Scatter(title, groups, x_label, y_label, equal):
+            return scatter(title, groups, x_label, y_label, equal)
+        case Histogram(title, groups, bins, label):
+            return histogram(title, groups, bins, label)
+        case Strips(title, rows, label):
+            return strips(title, rows, label)
+        case Bars(title, counts, group, label):
+            return bars(title, counts, group, label)
 
 
 def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = False) -> Panel:

@@ -13,7 +13,6 @@ from pathlib import Path
 from PIL import Image
 
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer
-from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
@@ -83,7 +82,7 @@ class Stage:
     def _twin(self) -> Trajectory:
         return replay(shared(self.demo.task), self.demo, "twin", self.replay)
 
-    def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
+    def strip(self, perturbation: Perturbation) -> list[tuple[int, list[Frame]]]:
         """Render the agent view at some steps of a pushed replay, each without the push and with it.
 
         Raises:
@@ -208,7 +207,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
 
 
 def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
-    if not isinstance(push, DisturbancePerturbation):
+    if push.acts_until is None:
         return []
     caption = f"without and with {describe(push)}"
     try:

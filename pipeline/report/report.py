@@ -13,6 +13,7 @@ import yaml
 from PIL import Image
 
 from pipeline.axes import Perturbation, TextPerturbation, from_json
+from pipeline.axes.report_data import KeptPerturbation
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import read_json
@@ -20,7 +21,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
 from pipeline.planning.streams import streams_of
 from pipeline.report import coverage, figures, pages, seen, yields
-from pipeline.report.coverage import AxisPlots, Draw
+from pipeline.report.coverage import AxisPlots
 from pipeline.report.figures import Panel
 from pipeline.report.pages import Clip
 from pipeline.report.sheets import describe_all, name_episode
@@ -187,12 +188,12 @@ def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
             drawn_on.setdefault(made.axis, []).append((row, made))
     for axis, of_axis in drawn_on.items():
         table = yields.by_level("kept of planned, by component", [row for row, _ in of_axis], axis)
-        draws = []
+        kept = []
         for row, made in of_axis:
             if row["kept"]:
                 resolved = json.loads(row["resolved"]).get(axis)
-                draws.append(Draw(find_task(row["suite"], row["task"]), made, resolved))
-        plots_and_tables[axis] = coverage.plot_axis(axis, draws, test), table
+                kept.append(KeptPerturbation(find_task(row["suite"], row["task"]), made, resolved))
+        plots_and_tables[axis] = coverage.plot_axis(axis, kept, test), table
     return plots_and_tables
 
 

@@ -11,7 +11,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
-from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.run.counts import by_axis, twins
@@ -92,9 +91,9 @@ def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
 
 def _moment(perturbations: Sequence[Perturbation], steps: int) -> int:
     """Return the step at which an episode of ``steps`` steps is shown."""
-    for push in perturbations:
-        if isinstance(push, DisturbancePerturbation):
-            return min(push.first_step + push.steps, steps - 1)
+    for change in perturbations:
+        if change.acts_until is not None:
+            return min(change.acts_until, steps - 1)
     # The arm is back on the demonstration's path soon after another start.
     return 0 if any(change.layer is Layer.PHYSICS for change in perturbations) else int(MOMENT * steps)
 

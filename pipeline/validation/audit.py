@@ -21,7 +21,6 @@ import tensorflow_datasets as tfds
 
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
-from pipeline.axes.camera_pose import moved_to
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
@@ -36,6 +35,7 @@ from pipeline.planning.leakage import check as compare
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TESTED_SUITES, TestSet
 from pipeline.types import Floats, Task
+from pipeline.validation.camera_pose import moved_to
 
 LABELS = ("suite", "task", "perturbations")
 
@@ -213,7 +213,7 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
     """Describe an episode in the axes' parameters, as far as it shows them, or else by its labels."""
     perturbations = [p for p in _labels(episode) if task is not None or not _needs_task(p)]
     if episode.extrinsics is not None:
-        perturbations = [p for p in perturbations if p.axis != "camera"]
+        perturbations = [p for p in perturbations if AXES[p.axis].audited != "cameras"]
         arenas = list(ARENAS) if task is None else [bddl.read(task.bddl_file).arena]
         cameras = [moved_to(episode.extrinsics, arena) for arena in arenas]
         if None not in cameras:
@@ -231,9 +231,9 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
 
 
 def _labels(episode: StoredEpisode) -> list[Perturbation]:
-    """Return the labels of an episode except language, which its instruction shows."""
+    """Return the labels of an episode except those that its instruction shows."""
     labels = () if episode.perturbations is None else from_json(episode.perturbations)
-    return [p for p in labels if p.axis != "language"]
+    return [p for p in labels if AXES[p.axis].audited != "instructions"]
 
 
 def _needs_task(perturbation: Perturbation) -> bool:

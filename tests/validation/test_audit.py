@@ -19,7 +19,6 @@ from synthetic import IDS, NAME, episode, loop
 
 from pipeline.__main__ import main
 from pipeline.axes import AXES
-from pipeline.axes.camera_pose import moved_to
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
@@ -34,6 +33,7 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Episode, Floats
 from pipeline.validation.audit import Audit, audit
+from pipeline.validation.camera_pose import moved_to
 
 TASK = find_task("libero_goal", "put_the_bowl_on_the_plate")
 OWN_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
