@@ -20,8 +20,7 @@ from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
 from pipeline.types import Episode, Extra, Geometry

@@ -8,8 +8,7 @@ import pyarrow as pa
 
 from pipeline.export_config import ExportConfig
 from pipeline.formats.base import Format
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.types import Extra
 

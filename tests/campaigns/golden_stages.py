@@ -17,9 +17,10 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
-from pipeline.formats.lerobot_statistics import DEVIATION, FIGURES, MEAN_LEVELS
-from pipeline.formats.lerobot_video import ENCODER, OPTIONS, planes
+from pipeline.formats.lerobot.columns import ENCODER, ENCODER_OPTIONS
+from pipeline.formats.lerobot.write import planes
 from pipeline.formats.read_back import Copy, Statistics, sampled
+from pipeline.formats.stated_statistics import DEVIATION, FIGURES, MEAN_LEVELS
 from pipeline.images.jpeg import decode
 from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.report import figures
@@ -54,7 +55,7 @@ def lerobot_v21() -> str:
 
 def _encoded() -> str:
     first_frame = planes(decode(episode(IDS[0]).frames["image"][0]))
-    return digest(hashlib.sha256(first_frame.tobytes()).hexdigest(), ENCODER, OPTIONS)
+    return digest(hashlib.sha256(first_frame.tobytes()).hexdigest(), ENCODER, ENCODER_OPTIONS)
 
 
 def _written(write: Callable[[Path], Any]) -> str:

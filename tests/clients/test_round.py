@@ -32,8 +32,7 @@ from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats import exact_statistics
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.libero.starts import kept_actions
 from pipeline.run.export import export

@@ -28,8 +28,7 @@ from pipeline.clients import recipe
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig, Where
 from pipeline.formats.episodes import Episodes, Known, split
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run.export import export

@@ -23,8 +23,7 @@ from pipeline.axes.camera_pose import moved_to
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.libero.arenas import ARENAS, Arena
 from pipeline.libero.tasks import find_task

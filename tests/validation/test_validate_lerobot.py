@@ -19,9 +19,8 @@ from pipeline.config import Config, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotV21Config
-from pipeline.formats import lerobot_video
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
+from pipeline.formats.lerobot.write import Video
 from pipeline.formats.read_back import Fault
 from pipeline.formats.registry import formats_of
 from pipeline.run import manifest
@@ -134,7 +133,7 @@ def bleach(root: Path, version: str) -> None:
     for file in root.glob("videos/**/*.mp4"):
         with av.open(str(file)) as video:
             grey = [frame.to_ndarray(format="gray") for frame in video.decode(video=0)]
-        with lerobot_video.Video(file) as again:
+        with Video(file) as again:
             for frame in grey:
                 again.add(np.repeat(frame[..., None], 3, axis=2), first=False)
 
