@@ -50,7 +50,7 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
         for view in SCHEMA.views:
             name = f"{view} of step {step}"
             stored = case.made.frames[view][step]
-            again = encode(_turned(fresh[view]), config)
+            again = encode(_turned(fresh[view]), config.jpeg_quality)
             same = exact and stored == again
             for seen in case.seen:
                 if seen.view != view or (same and seen.dataset == "frames"):

@@ -143,7 +143,7 @@ def _follow(run: Run) -> Iterator[tuple[str, str]]:
             why = f"the dataset has {reason}"
         else:
             continue
-        yield f"export_{dataset.stage_record.stem}", f"{dataset.title}: {why}"
+        yield f"export_{dataset.group}", f"{dataset.title}: {why}"
         stale = True
     if stale:
         yield "manifest and all that follows", "the datasets are not those"

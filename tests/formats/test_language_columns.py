@@ -19,8 +19,7 @@ from synthetic import IDS, NAME, episode, episodes, loop, write_lerobot
 
 from pipeline.config import load
 from pipeline.errors import PipelineError
-from pipeline.export_config import LeRobotConfig
-from pipeline.formats.lerobot import LeRobot, read
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, read
 from pipeline.run.export import export
 from pipeline.types import Episode, Subtask
 from pipeline.validation.case import Case

@@ -12,11 +12,10 @@ from typing import Any
 import pytest
 from synthetic import IDS, episode, episodes, files, loop
 
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats import lerobot
 from pipeline.formats.base import Format
-from pipeline.formats.lerobot import LeRobot, LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export, is_current
 from pipeline.types import Episode
 

@@ -51,7 +51,7 @@ def flip_gripper(tree: Tree) -> None:
 def turn_back(tree: Tree) -> None:
     for step in tree["steps"]:
         frame = decode(step["observation"]["image"])
-        step["observation"]["image"] = encode(np.ascontiguousarray(frame[::-1, ::-1]), RenderConfig())
+        step["observation"]["image"] = encode(np.ascontiguousarray(frame[::-1, ::-1]), RenderConfig().jpeg_quality)
 
 
 def freeze(tree: Tree) -> None:

@@ -2,32 +2,71 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
 from math import ceil
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import pyarrow as pa
+from packaging.version import Version
+from pydantic import Field, field_validator
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, GripperSpec
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config
-from pipeline.formats.base import Format, Row, StepSizes
+from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
 from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Convention, camera_column
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
-from pipeline.identity import Step
 from pipeline.tables import column
-from pipeline.types import Extra
+from pipeline.types import Count, Extra
 
 EPISODES_OF_A_PIECE = 50
 """Largest number of episodes that are written again after a call was killed; the files do not depend on it."""
 
 
+class LeRobotConfig(FormatOptions):
+    """Options of the LeRobot dataset.
+
+    Attributes:
+        name: of the dataset; ``libero_`` and the name of the run when left out.
+        shards: files of each kind, at least; more where one would have more than 200 MB.
+        frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
+        validation: share of each task's demonstrations whose episodes come last, as the split ``val``.
+        language: whether frames also have their task's rewrites and what is being done, in lerobot's language column.
+            lerobot before 0.6 cannot read a set with it.
+    """
+
+    name: Name = ""
+    # The identity of finished datasets depends on their options, which contain the field under its first name.
+    shards: Count | None = Field(default=None, serialization_alias="parts")
+    frames: Literal["video", "images"] = "video"
+    validation: Share = 0.0
+    # Excluded at its default, as ``lerobot_v21``.
+    language: bool = Field(default=False, exclude_if=lambda language: not language)
+
+    @field_validator("language")
+    @classmethod
+    def _readable(cls, language: bool) -> bool:
+        if not language:
+            return language
+        installed = version("lerobot")
+        if Version(installed) < Version("0.6"):
+            raise ValueError(
+                f"lerobot {installed}, which checks the set here, cannot read language columns; expected 0.6 or later, "
+                "which the installation on Python 3.12 or later has"
+            )
+        return language
+
+
 class LeRobot(Format[LeRobotConfig]):
     """Dataset in which files of one number hold the same episodes: of data, of each video and of ``meta/episodes``."""
 
-    name: ClassVar[Step] = "lerobot"
+    name: ClassVar = "lerobot"
     title: ClassVar = "LeRobot"
+    options_type: ClassVar = LeRobotConfig
+    by_default: ClassVar = True
+    recipe: ClassVar = 8
+    packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = "lerobot"
     rewrites_instructions: ClassVar = True
     step_s: ClassVar = 0.0015
@@ -147,14 +186,32 @@ hf download {repository} --repo-type dataset --local-dir $DATA --include "finetu
 """
 
 
+class LeRobotV21Config(FormatOptions):
+    """Options of LeRobot datasets of version 2.1.
+
+    Attributes:
+        name: of the dataset, or what the sets' names begin with; ``libero_`` and the name of the run when left out.
+        convention: ``ipec`` for GR00T, starVLA and others: a set for each suite, as IPEC-COMMUNITY's of LIBERO, with
+            videos and a gripper of 1 open, 0 closed. ``openpi``: one set, as openpi's configuration of LIBERO reads it.
+        validation: share of each task's demonstrations whose episodes go into sets of their own, named ``..._val``.
+    """
+
+    name: Name = ""
+    convention: Literal["ipec", "openpi"]
+    validation: Share = 0.0
+
+
 class LeRobotV21(Format[LeRobotV21Config]):
     """Sets of v2.1, in which each episode has files of its own.
 
     Validation episodes form sets of their own, because no client reads splits.
     """
 
-    name: ClassVar[Step] = "lerobot_v21"
+    name: ClassVar = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
+    options_type: ClassVar = LeRobotV21Config
+    recipe: ClassVar = 3
+    packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = LeRobot.group
     step_s: ClassVar = LeRobot.step_s
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
