@@ -133,7 +133,7 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
             for noise in of_layer(perturbations, PixelPerturbation):
                 if view in noise.views:
                     frame = noise.apply(frame, step)
-            frames[view].append(encode(to_policy(frame), config.render))
+            frames[view].append(encode(to_policy(frame), config.render.jpeg_quality))
         env.step(action)
     env.close()
     return frames

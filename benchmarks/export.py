@@ -19,11 +19,10 @@ import numpy as np
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.run.export import export
 from pipeline.types import Episode, Geometry, Jpeg

@@ -92,7 +92,7 @@ def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool, dr
                 start, drawn_before_s = time.process_time(), drawn.spent_s
                 renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                 pictures.append(renderer.frame(camera))
-                encode(to_policy(pictures[-1]), RenderConfig())
+                encode(to_policy(pictures[-1]), RenderConfig().jpeg_quality)
                 took_s = time.process_time() - start
                 spent_s[name] += took_s
                 beside_s[name] += took_s - (drawn.spent_s - drawn_before_s)

@@ -69,7 +69,7 @@ def render(
     streams_of_frames: dict[str, list[Jpeg]] = {}
     for stream in streams:
         patterns = [_pattern(f"{stream.stream_id} {step}") for step in range(steps)]
-        streams_of_frames[stream.stream_id] = [encode(pattern, config) for pattern in patterns]
+        streams_of_frames[stream.stream_id] = [encode(pattern, config.jpeg_quality) for pattern in patterns]
     geometries = {stream.geometry for stream in streams}
     fixed = Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
     state = np.zeros((steps, 8), np.float32)

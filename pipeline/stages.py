@@ -14,9 +14,11 @@ from rich.console import Console
 
 from pipeline import gl
 from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.export_config import FAILURES
 from pipeline.files import read_json, write, write_json
 from pipeline.formats import exact_statistics, registry
 from pipeline.formats.episodes import by_suite
+from pipeline.formats.rlds import Rlds
 from pipeline.identity import refuse_unasked
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
@@ -27,6 +29,7 @@ from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.layout import (
     CARD,
     COUNTS,
+    DATASETS,
     FINETUNE,
     INPUTS,
     LEAKAGE,
@@ -81,17 +84,8 @@ def write_inputs(run: Run) -> None:
     run.frames.notice_changes()
     for dataset in (*run.formats, *run.failure_formats):
         export.notice_changes(dataset)
-    write_json(run.path(SETTINGS), {**inputs.settings(run.config), "lost": _lost(run)})
-
-
-def _lost(run: Run) -> dict[str, list[str]]:
-    """List the missing records that are no outputs for DVC, by the stage's record: not every run has these datasets."""
-    lost: dict[str, list[str]] = {group: [] for group in registry.GROUPS}
-    for dataset in (*run.formats, *run.failure_formats):
-        record = dataset.record_file
-        if record != dataset.stage_record and not record.exists():
-            lost[dataset.stage_record.stem].append(record.relative_to(run.folder).as_posix())
-    return lost
+    export.unlist_lost_records(run)
+    write_json(run.path(SETTINGS), inputs.settings(run.config))
 
 
 def doctor(run: Run) -> None:
@@ -195,22 +189,22 @@ def _export(group: str) -> Stage:
 
     def write_datasets(run: Run) -> None:
         for kind in kinds:
-            # DVC needs the record after which the stage is named, also if the format is not requested.
             if kind is kinds[0] or kind.name in run.config.export.formats:
                 export.export_run(kind, run)
+        export.list_records(run)
         say_stale(group, run)
 
     def whole(run: Run) -> bool:
-        """Return whether the finished datasets have all their files, unchanged."""
+        """Return whether the finished datasets have all their files, unchanged, and their records are listed."""
         datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
-        return all(export.untouched(dataset) for dataset in datasets)
+        return run.path(DATASETS).exists() and all(export.untouched(dataset) for dataset in datasets)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
     settings, files = [*_EXPORT], [*_OUTCOME]
     if any(kind.rewrites_instructions for kind in kinds):
         # The rewrites of a task depend on the plan's language axis and on the user's own bank.
         settings, files = [*_EXPORT, "plan"], [INPUTS, *_OUTCOME]
-    records_of_failures = [f"{registry.FAILURES}/{record}" for record in records]
+    records_of_failures = [f"{FAILURES}/{record}" for record in records]
     return Stage(write_datasets, settings, files, (*records, *records_of_failures), whole)
 
 
@@ -225,7 +219,7 @@ def write_manifest(run: Run) -> None:
     motions = {name: run.frames.motion(name) for name in {*trajectory_of.values()}}
     suites = {episode_id: row_of[episode_id].suite for episode_id in outcome.kept}
     figures = {}
-    for name, members in by_suite(suites, (config.export.rlds or config.export).name).items():
+    for name, members in by_suite(suites, (config.export.options_for(Rlds) or config.export).name).items():
         figures[name] = exact_statistics.openvla([motions[trajectory_of[episode_id]] for episode_id in members])
     write_json(run.path(STATISTICS), figures)
     write_json(run.path(COUNTS), counts.by_axis_and_suite(table.to_pylist()))
@@ -349,12 +343,12 @@ STAGES = {
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
     "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
-    "recipe": Stage(write_recipe, ("export",), (MANIFEST, "lerobot.json", "lerobot_v21.json"), (FINETUNE,)),
+    "recipe": Stage(write_recipe, ("export",), (MANIFEST, *_RECORDS), (FINETUNE,)),
     "summary": Stage(summarize),
     "card": Stage(write_card, ("export", "publish"), (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
     "report": Stage(write_report),
 }
-"""Name to stage, in the order in which they run."""
+"""Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""
 
 
 def run_all(file: Path) -> Run:

@@ -143,7 +143,7 @@ def _stale_datasets(run: Run) -> Iterator[tuple[str, str]]:
             why = f"the dataset has {reason}"
         else:
             continue
-        yield f"export_{dataset.stage_record.stem}", f"{dataset.title}: {why}"
+        yield f"export_{dataset.group}", f"{dataset.title}: {why}"
 
 
 def _of(made_anew: Counter[str], what: str) -> str:

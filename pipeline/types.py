@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NewType
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
     import mujoco
@@ -31,6 +31,12 @@ class Frozen(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+"""A number of files. Its limit is above any use: larger numbers would fill memory before any message appears."""
+
+LONGEST_NAME = 60
+"""Largest length of a name in paths. A path may join several names; file systems limit a name to 255 bytes."""
 
 Place = Annotated[Path, AfterValidator(Path.expanduser)]
 """A path of a configuration; ``~`` is the home folder, as in a shell."""

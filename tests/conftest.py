@@ -239,7 +239,7 @@ def tiny_config(demos: Path) -> dict[str, Any]:
 
 
 STAGES = (
-    *("inputs", "plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest"),
+    *("inputs", "plan", "leakage", "replay", "render", "exports", "manifest"),
     *("validate", "recipe", "summary", "card", "report"),
 )
 

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export
 from pipeline.types import Episode, Extra, Geometry, Jpeg
 
@@ -113,6 +112,13 @@ def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -
         source = episode(episode_id)
         facts[episode_id] = Known("libero_spatial", content, "", source.instruction, len(source))
     return Episodes(facts, load)
+
+
+def write_format(kind: type[Format[Any]], out: Path) -> Format[Any]:
+    """Write the dataset of a format with its default options."""
+    target = kind(out, kind.options_type(name=NAME))
+    export(target, episodes(), loop)
+    return target
 
 
 def write_rlds(

@@ -81,8 +81,8 @@ AXIS_IS_SUBJECT = {
     # What two axes do to a scene, which sampling a plan must not load.
     *("pipeline.scenes.placement", "pipeline.scenes.moving"),
     # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
-    *("pipeline.formats.lerobot_columns", "pipeline.formats.lerobot_episode", "pipeline.evaluation.harness"),
-    *("pipeline.export_config", "pipeline.rendering.geometry"),
+    *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write"),
+    *("pipeline.evaluation.harness", "pipeline.rendering.geometry"),
 }
 """Modules outside of ``axes`` in which a string may be the name of an axis."""
 

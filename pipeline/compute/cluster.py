@@ -21,6 +21,7 @@ from packaging.requirements import Requirement
 from pipeline.compute.workers import VARIABLES
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, schema_file
+from pipeline.formats.registry import FORMATS
 from pipeline.identity import DISTRIBUTION, PACKAGES
 from pipeline.machine_code import MACHINE_CODE_VARIABLES, in_shell, machine_code
 from pipeline.seeding import digest
@@ -104,7 +105,8 @@ def setup() -> dict[str, str]:
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
         required = [Requirement(line).name for line in requires(DISTRIBUTION) or []]
-        for name in (DISTRIBUTION, *required, *chain.from_iterable(PACKAGES.values())):
+        of_formats = [kind.packages for kind in FORMATS]
+        for name in (DISTRIBUTION, *required, *chain.from_iterable([*PACKAGES.values(), *of_formats])):
             versions[name] = version(name)
     except PackageNotFoundError as error:
         versions[str(error.name)] = "not installed"

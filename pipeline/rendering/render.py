@@ -52,7 +52,7 @@ def render(
             for step in steps:
                 frames = frames_of(renderer, trajectory.states[step], trajectory.site_alpha[step], scene, step)
                 for stream, frame in zip(scene, frames, strict=True):
-                    encoded[stream.stream_id].append(encode(frame, render_config))
+                    encoded[stream.stream_id].append(encode(frame, render_config.jpeg_quality))
     views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in rejected)
     return Rendered(
         replay_mode=trajectory.mode,

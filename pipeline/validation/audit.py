@@ -25,7 +25,7 @@ from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.formats.lerobot_columns import EPISODE_ID, camera_column
+from pipeline.formats.lerobot.columns import EPISODE_ID, camera_column
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS

@@ -26,7 +26,6 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN
 from pipeline.formats.base import StepSizes
-from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
@@ -87,7 +86,7 @@ def needed_mb(config: Config) -> dict[str, float]:
         + amounts.steps * (poses_kb + MOTION_KB),
     }
     sizes = StepSizes(frame_kb, map_kb, poses_kb, MOTION_KB)
-    for dataset in formats_of(config.data, config.export, extras):
+    for dataset in config.export.datasets(config.data, extras):
         needed_kb[dataset.name] = steps * dataset.step_kb(sizes) + episodes * EPISODE_KB
     return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
 
@@ -122,7 +121,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
             rendered_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + maps_s * mapped)
             encoded_s += episodes * amounts.mean_steps * ENCODE_S * bool(here)
     processor = speed.step_s / REFERENCE.step_s
-    datasets = formats_of(config.data, config.export, config.render.extras)
+    datasets = config.export.datasets(config.data, config.render.extras)
     _, exported_steps = _exported(config, amounts)
     return {
         "replay": trajectories * replay_s(amounts.mean_steps, speed),

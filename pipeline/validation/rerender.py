@@ -50,7 +50,7 @@ def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iter
         for view in SCHEMA.views:
             name = f"{view} of step {step}"
             stored = case.made.frames[view][step]
-            again = encode(_turned(fresh[view]), render_config)
+            again = encode(_turned(fresh[view]), render_config.jpeg_quality)
             same = exact and stored == again
             for seen in case.seen:
                 if seen.view != view or (same and seen.dataset == "frames"):

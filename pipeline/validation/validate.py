@@ -17,6 +17,7 @@ from typing import Any
 from pipeline.clients import oft
 from pipeline.compute.pool import Workers
 from pipeline.errors import PipelineError
+from pipeline.export_config import FAILURES
 from pipeline.files import read_json, scratch
 from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
@@ -98,7 +99,7 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
                     if episode_id in missed:
                         failed[episode_id] = row | places.get(episode_id, {})
                 job = EpisodesJob(run, failures, cache, frozenset([*failed][:1]), ("outcome",))
-                total.add(_datasets(job, failed, workers), within=f"{registry.FAILURES}/")
+                total.add(_datasets(job, failed, workers), within=f"{FAILURES}/")
         finally:
             scene_of_process().close()
     report = {}

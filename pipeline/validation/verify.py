@@ -67,7 +67,7 @@ def _readers(run: Run) -> list[Callable[[], object]]:
         partial(plan.read, run.plan_file),
         partial(manifest.read, run.manifest_file),
     ]
-    names = [COUNTS, LEAKAGE, *([STATISTICS] if run.config.export.rlds else [])]
+    names = [COUNTS, LEAKAGE, *([STATISTICS] if "rlds" in run.config.export.formats else [])]
     return [*readers, *(partial(read_json, run.path(name)) for name in names)]
 
 

@@ -247,8 +247,7 @@ def _record() -> bytes:
 
 
 def _read_record(file: Path) -> object:
-    from pipeline.export_config import RldsConfig
-    from pipeline.formats.rlds import Rlds
+    from pipeline.formats.rlds import Rlds, RldsConfig
 
     return Rlds(file.parent, RldsConfig(name="libero_tiny", shards=1)).record()
 

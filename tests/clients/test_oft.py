@@ -18,10 +18,9 @@ from pipeline.clients import oft
 from pipeline.compute.pool import loop
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.export_config import RldsConfig
 from pipeline.formats import exact_statistics, rlds_write
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.rlds_layout import datasets
 from pipeline.run.export import export
 from pipeline.types import Episode, Geometry, Jpeg

@@ -14,7 +14,6 @@ from tiny_recipe import NAME, ROWS, SUITES, export_config, row, tiny_recipe
 
 from pipeline.clients.recipe import build, write
 from pipeline.files import schema_file
-from pipeline.formats.registry import formats_of
 
 
 def test_recipe_counts_what_was_kept(tmp_path: Path) -> None:
@@ -48,7 +47,7 @@ def test_openvla_oft_measures_what_every_set_holds_out(held_out: tuple[str, ...]
 @pytest.mark.parametrize("convention", ["ipec", "openpi"])
 def test_every_client_is_named_by_the_format_that_it_reads(convention: str, tmp_path: Path) -> None:
     export = export_config(lerobot_v21={"name": NAME, "convention": convention})
-    named = [client for one in formats_of(tmp_path, export) for client in one.clients]
+    named = [client for one in export.datasets(tmp_path) for client in one.clients]
     assert sorted(named) == sorted(tiny_recipe(tmp_path, export)["clients"])
 
 

@@ -104,7 +104,7 @@ def run(folder: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch
     file.parent.mkdir(exist_ok=True)
     file.write_text(yaml.safe_dump(config))
     monkeypatch.chdir(folder)
-    for stage in ("plan", "replay", "render", "export_rlds"):
+    for stage in ("plan", "replay", "render", "exports"):
         monkeypatch.setattr(sys, "argv", [stage, "configs/tiny.yaml"])
         runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"), run_name="__main__")
     data = folder / "data" / "tiny"

@@ -301,7 +301,7 @@ def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def stills(steps: int) -> Episode:
     """Frames with the step in their grey level."""
-    frames = [encode(np.full((256, 256, 3), 8 * step, np.uint8), STARTER.render) for step in range(steps)]
+    frames = [encode(np.full((256, 256, 3), 8 * step, np.uint8), STARTER.render.jpeg_quality) for step in range(steps)]
     nothing = np.zeros((steps, 7), np.float32)
     return Episode("", {"image": frames}, nothing, nothing, nothing, "", {}, {})
 

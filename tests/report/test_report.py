@@ -237,7 +237,7 @@ def _content(address: str) -> bytes:
 
 
 def _still(frame: NDArray[np.uint8]) -> Jpeg:
-    return encode(frame, RenderConfig())
+    return encode(frame, RenderConfig().jpeg_quality)
 
 
 def _video(clip: pages.Clip) -> NDArray[np.float64]:

@@ -129,7 +129,9 @@ def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:
     config = Config.model_validate({"name": "seen", "folder": tmp_path, "demos": demos, "plan": wanted})
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
     plan.write(rows, config.data / "plan.parquet")
-    clean, lighter = (encode(np.full((256, 256, 3), level, np.uint8), config.render) for level in (100, 120))
+    clean, lighter = (
+        encode(np.full((256, 256, 3), level, np.uint8), config.render.jpeg_quality) for level in (100, 120)
+    )
     twins, noisy = (streams_of(row.perturbations) for row in rows)
     view = Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
     state, motion = np.zeros((1, 8), np.float32), np.zeros((1, 7), np.float32)

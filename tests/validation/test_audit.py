@@ -20,11 +20,9 @@ from synthetic import IDS, NAME, episode, loop
 from pipeline.__main__ import main
 from pipeline.axes import AXES
 from pipeline.errors import PipelineError
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.libero.arenas import ARENAS, Arena
 from pipeline.libero.tasks import find_task
 from pipeline.run.export import export
