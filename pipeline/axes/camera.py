@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from pipeline.axes.base import (
     Degrees,
     Frozen,
     Intervals,
+    Level,
     RenderPerturbation,
     draw,
     level_from,
@@ -263,6 +264,10 @@ class CameraAxis(Axis):
 
     There every value is taken, so a draw changes something else as well, which keeps it 5 degrees from all of them:
     a distance of 1.6 with 6 degrees of elevation is clear. What the defaults show was looked at in all five arenas.
+
+    Attributes:
+        components: which of them, each as often as the others.
+        aside: ranges of the second change.
     """
 
     draws: ClassVar = (CameraPerturbation,)
@@ -270,17 +275,25 @@ class CameraAxis(Axis):
     dimension: ClassVar = "camera"
     audited: ClassVar = "cameras"
 
-    distance: DistanceRange | None = DistanceRange()
-    spherical: SphericalRange | None = SphericalRange()
-    orientation: OrientationRange | None = OrientationRange()
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = get_args(Component)
+    distance: DistanceRange = DistanceRange()
+    spherical: SphericalRange = SphericalRange()
+    orientation: OrientationRange = OrientationRange()
     aside: AsideRange = AsideRange()
 
-    @model_validator(mode="after")
-    def _some_component(self) -> CameraAxis:
-        """Check that at least one component is left."""
-        if not (self.distance or self.spherical or self.orientation):
+    @model_validator(mode="before")
+    @classmethod
+    def _leave_out_null(cls, raw: Any) -> Any:
+        """Leave out components whose ranges are null, as configurations did before ``components``."""
+        if not isinstance(raw, Mapping):
+            return raw
+        null = [name for name in get_args(Component) if name in raw and raw[name] is None]
+        if not null:
+            return raw
+        left = [name for name in raw.get("components", get_args(Component)) if name not in null]
+        if not left:
             raise ValueError("leave at least one of distance, spherical and orientation")
-        return self
+        return {name: ranges for name, ranges in raw.items() if name not in null} | {"components": left}
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
@@ -295,22 +308,24 @@ class CameraAxis(Axis):
                 return level_from(max(abs(value["yaw_deg"]), abs(value["pitch_deg"])) / 2)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        components = (self.distance, self.spherical, self.orientation)
-        chosen = pick(rng, [ranges for ranges in components if ranges is not None])
-        level = self.draw_level(rng)
-        component: Component
-        match chosen:
-            case DistanceRange():
-                component = "distance"
-                drawn = {"distance_scale": draw(rng, chosen.distance_scale[level - 1])}
-            case SphericalRange():
-                component = "spherical"
-                azimuth_deg = draw(rng, chosen.azimuth_deg[level - 1])
-                drawn = {"azimuth_deg": azimuth_deg, "elevation_deg": draw(rng, chosen.elevation_deg)}
-            case OrientationRange():
-                component = "orientation"
-                large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
-                turn_deg = draw(rng, chosen.turn_deg[level - 1])
-                drawn = {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
+        component = pick(rng, self.components)
+        return self._draw(rng, component, self.draw_level(rng))
+
+    def _draw(self, rng: np.random.Generator, component: Component, level: Level) -> CameraPerturbation:
+        """Sample a perturbation of a component at a level."""
+        drawn = self._draw_parameters(rng, component, level)
         drawn |= self.aside.draw(rng, pick(rng, ASIDES[component]))
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
+
+    def _draw_parameters(self, rng: np.random.Generator, component: Component, level: Level) -> dict[str, float]:
+        """Sample the parameters that a component changes."""
+        match component:
+            case "distance":
+                return {"distance_scale": draw(rng, self.distance.distance_scale[level - 1])}
+            case "spherical":
+                azimuth_deg = draw(rng, self.spherical.azimuth_deg[level - 1])
+                return {"azimuth_deg": azimuth_deg, "elevation_deg": draw(rng, self.spherical.elevation_deg)}
+            case "orientation":
+                large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
+                turn_deg = draw(rng, self.orientation.turn_deg[level - 1])
+                return {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}

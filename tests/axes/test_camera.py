@@ -120,9 +120,6 @@ def test_draws_are_keyed_and_cover_every_component_and_level() -> None:
 
 def test_the_level_is_the_strength_of_what_the_component_is_about() -> None:
     axis = CameraAxis()
-    assert axis.distance is not None
-    assert axis.spherical is not None
-    assert axis.orientation is not None
     for p in draws(axis):
         by_level, strength = {
             "distance": (axis.distance.distance_scale, p.distance_scale),
@@ -156,10 +153,18 @@ def test_no_side_is_preferred() -> None:
 
 
 def test_levels_and_components_can_be_chosen() -> None:
-    axis = CameraAxis(levels=(2, 5), distance=None, orientation=None)
+    axis = CameraAxis(levels=(2, 5), components=("spherical",))
     assert {(p.component, p.level) for p in draws(axis, 50)} == {("spherical", 2), ("spherical", 5)}
+    with pytest.raises(ValidationError, match="components"):
+        CameraAxis(components=())
+
+
+def test_a_component_that_is_null_is_left_out_as_before() -> None:
+    """Configurations of earlier versions."""
+    written = CameraAxis.model_validate({"distance": None, "orientation": None, "levels": [2]})
+    assert written == CameraAxis(components=("spherical",), levels=(2,))
     with pytest.raises(ValidationError, match="at least one of distance"):
-        CameraAxis(distance=None, spherical=None, orientation=None)
+        CameraAxis.model_validate({"distance": None, "components": ["distance"]})
 
 
 def test_default_draws_are_mostly_clear_of_every_test_camera(test_set: TestSet) -> None:
