@@ -181,6 +181,11 @@ class Axis(Frozen):
         """List the entries that the axis takes its perturbations of a task from; empty if it samples from ranges."""
         return ()
 
+    @property
+    def keeps_clearance(self) -> bool:
+        """Return whether perturbations keep their clearance to the test tasks."""
+        return True
+
     def refuse_tested(self, test: TestSet, task: Task) -> None:
         """Reject levels without any perturbation that keeps its clearance, as far as the ranges show this.
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
+from pipeline import seeding
 from pipeline.axes.base import (
     Axis,
     ByLevel,
@@ -23,8 +25,9 @@ from pipeline.axes.base import (
     pick,
     point,
 )
+from pipeline.errors import PipelineError
 from pipeline.rotations import about, product, rotate
-from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.testset.benchmark import TESTED_SUITES, TestSet, TestTask
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -107,7 +110,12 @@ class CameraPerturbation(RenderPerturbation):
         camera.pos[:], camera.quat[:] = self.pose(camera.pos.copy(), camera.quat.copy())
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """Return the distances (N,) to the test cameras of all tasks, because many tasks share one nominal view."""
+        """Return the distances (N,) to the test cameras of all tasks, because many tasks share one nominal view.
+
+        They are NaN for a task of a suite without test tasks: LIBERO-90's and the user's own.
+        """
+        if task.suite not in TESTED_SUITES:
+            return np.full(len(test.on_axis(self.axis)), np.nan)
         cameras, places = _test_cameras(test)
         return self._angles_deg(cameras)[places]
 
@@ -258,6 +266,22 @@ ASIDES: dict[Component, tuple[Aside, ...]] = {
 }
 """Kinds of second change of each component's perturbations, each with equal probability."""
 
+COMPONENT_OF: dict[Aside, Component] = {
+    "elevation": "spherical",
+    "distance": "distance",
+    "turn": "orientation",
+    "yaw": "orientation",
+}
+"""Component whose configured ranges a kind of second change keeps."""
+
+ClearBy = Literal["second_change", "resample", "off"]
+
+SECOND_CHANGES = 20
+"""Most attempts to sample a second change within the configured ranges."""
+
+TRIED_CAMERAS = 300
+"""Number of cameras of a component and level of which at least one has to keep its clearance."""
+
 
 class CameraAxis(Axis):
     """The ranges to draw from: each component spans what LIBERO-Plus's test cameras of its kind do.
@@ -267,7 +291,12 @@ class CameraAxis(Axis):
 
     Attributes:
         components: which of them, each as often as the others.
-        aside: ranges of the second change.
+        clear_by: what keeps the cameras of the four tested suites at their clearance from the test cameras. No value
+            leaves a configured range, and cameras of other suites have no test cameras to keep away from.
+            ``second_change`` changes another one of ``components`` as well, within its ranges. ``resample`` only
+            samples again, which needs ranges that the test cameras leave free. ``off`` keeps no clearance:
+            ``leakage.json`` counts the overlaps, and the run goes on.
+        aside: ranges of the second change, as far as they are in the ranges of its component.
     """
 
     draws: ClassVar = (CameraPerturbation,)
@@ -279,6 +308,7 @@ class CameraAxis(Axis):
     distance: DistanceRange = DistanceRange()
     spherical: SphericalRange = SphericalRange()
     orientation: OrientationRange = OrientationRange()
+    clear_by: ClearBy = "second_change"
     aside: AsideRange = AsideRange()
 
     @model_validator(mode="before")
@@ -307,15 +337,77 @@ class CameraAxis(Axis):
             case _:
                 return level_from(max(abs(value["yaw_deg"]), abs(value["pitch_deg"])) / 2)
 
+    @property
+    def keeps_clearance(self) -> bool:
+        """Return whether cameras keep their clearance to the test cameras."""
+        return self.clear_by != "off"
+
+    def refuse_tested(self, test: TestSet, task: Task) -> None:
+        """Reject a component with a level at which the ranges have no camera at its clearance from the test cameras.
+
+        Raises:
+            PipelineError: naming component and levels.
+        """
+        if not self.keeps_clearance:
+            return
+        for component in dict.fromkeys(self.components):
+            near = [level for level in sorted({*self.levels}) if not self._has_clear(component, level, test, task)]
+            if near:
+                raise PipelineError(
+                    f"no {component} camera of level {', '.join(map(str, near))} within the ranges is at least "
+                    f"{CameraPerturbation.clearance:g} degrees from all test cameras",
+                    where="plan.axes.camera",
+                    expected="components that can change together with it, with ranges that reach 5 degrees",
+                    remedy="name more components or wider ranges; or clear_by: off, which lets training cameras equal "
+                    "test cameras",
+                )
+
+    def _has_clear(self, component: Component, level: Level, test: TestSet, task: Task) -> bool:
+        """Return whether one of ``TRIED_CAMERAS`` of a component and level keeps its clearance."""
+        random = seeding.rng("clear cameras", component, level)
+        for _ in range(TRIED_CAMERAS):
+            perturbation = self._draw(random, component, level, task)
+            if perturbation.nearest(test, task).distance >= perturbation.clearance:
+                return True
+        return False
+
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
         component = pick(rng, self.components)
-        return self._draw(rng, component, self.draw_level(rng))
+        return self._draw(rng, component, self.draw_level(rng), task)
 
-    def _draw(self, rng: np.random.Generator, component: Component, level: Level) -> CameraPerturbation:
+    def _draw(self, rng: np.random.Generator, component: Component, level: Level, task: Task) -> CameraPerturbation:
         """Sample a perturbation of a component at a level."""
         drawn = self._draw_parameters(rng, component, level)
-        drawn |= self.aside.draw(rng, pick(rng, ASIDES[component]))
+        if self.clear_by == "second_change" and task.suite in TESTED_SUITES:
+            drawn |= self._draw_second_change(rng, component)
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
+
+    def _draw_second_change(self, rng: np.random.Generator, component: Component) -> dict[str, float]:
+        """Sample a second change within the configured ranges; empty if none is found.
+
+        A camera without one is rarely clear, and then sampled again.
+        """
+        kinds = [kind for kind in ASIDES[component] if COMPONENT_OF[kind] in self.components]
+        if not kinds:
+            return {}
+        kind = pick(rng, kinds)
+        intervals = self._intervals(COMPONENT_OF[kind])
+        for _ in range(SECOND_CHANGES):
+            change = self.aside.draw(rng, kind)
+            value = max(change.values(), key=abs)
+            if any(low <= value <= high for low, high in intervals):
+                return change
+        return {}
+
+    def _intervals(self, component: Component) -> tuple[tuple[float, float], ...]:
+        """List the intervals of a component, of all levels, that a second change keeps."""
+        match component:
+            case "distance":
+                return tuple(chain(*self.distance.distance_scale))
+            case "spherical":
+                return self.spherical.elevation_deg
+            case "orientation":
+                return tuple(chain(*self.orientation.turn_deg))
 
     def _draw_parameters(self, rng: np.random.Generator, component: Component, level: Level) -> dict[str, float]:
         """Sample the parameters that a component changes."""

@@ -309,12 +309,14 @@ def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -
     assert (some.not_compared, some.verdict) == (1, "disjoint where compared")
 
 
-def run_stage(folder: Path, rows: list[Row]) -> subprocess.CompletedProcess[str]:
-    """The stage as DVC runs it, on a plan of these rows."""
+def run_stage(folder: Path, rows: list[Row], **axes: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """The stage as DVC runs it, on a plan of these rows, with other settings of some axes."""
     (folder / "data").mkdir(exist_ok=True)
     if not (folder / benchmark.FOLDER).exists():
         (folder / benchmark.FOLDER).symlink_to(FOLDER)
-    (folder / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(folder / "demos")))
+    config = tiny_config(folder / "demos")
+    config["plan"]["axes"] |= axes
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(config))
     with chdir(folder):
         claimed(Path("tiny.yaml"))
     plan.write(rows, folder / "data" / "tiny" / "plan.parquet")
@@ -344,6 +346,18 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
     assert (report["language"]["overlaps"], report["language"]["verdict"]) == (1, "overlap")
     assert all(math.isfinite(finding["clearance"]) for finding in report.values())
+
+
+@pytest.mark.slow
+def test_overlapping_cameras_are_reported_if_no_clearance_is_asked_for(test: TestSet, tmp_path: Path) -> None:
+    tested = next(iter(test.on_axis("camera")))
+    planted = row(find_task(tested.suite, tested.base), [repeated(tested)], "planted")
+    done = run_stage(tmp_path, [planted])
+    assert (done.returncode, "1 of 1 on the camera axis" in done.stderr) == (1, True)
+    done = run_stage(tmp_path, [planted], camera={"clear_by": "off"})
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
+    assert (report["camera"]["overlaps"], report["camera"]["verdict"]) == (1, "overlap")
 
 
 def test_an_overlap_is_explained_by_what_overlaps() -> None:
