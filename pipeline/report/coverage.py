@@ -152,7 +152,7 @@ def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> AxisPlots:
             ladder = sorted({(float(parameters["severity"]), float(parameters[name])) for parameters in tested})
             steps, values = np.array([(0.0, float(clean)), *ladder]).T
             at = np.interp([float(getattr(p.effect, name)) for p in of_component], values, steps)
-        rows[component] = {"benchmark": severities, "noise": at}
+        rows[component.replace("_", " ")] = {"benchmark": severities, "noise": at}
     return AxisPlots(
         f"{len(test.on_axis('noise')):,} test tasks at ten severities of each kind; a draw stands where its strength "
         "would, on the benchmark's scale.",

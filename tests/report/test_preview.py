@@ -276,7 +276,9 @@ def test_an_overview_shows_the_strongest_draw_that_the_scene_takes(
     assert len(captions) == 1 + len(Axes.model_fields)
     assert set(captions[1:]) <= refused
     # No paraphrase of the task is of level 5, as no task of libero_90 has rewrites.
-    monkeypatch.setattr(preview, "configured", lambda name, config: LanguageAxis(classes=("paraphrase",), levels=(5,)))
+    monkeypatch.setattr(
+        preview, "configured", lambda name, config: LanguageAxis(components=("paraphrase",), levels=(5,))
+    )
     captions.clear()
     preview.overview(stage, STARTER, NO_TESTS)
     assert captions == [f"clean twin: {BOWL.instruction}"]

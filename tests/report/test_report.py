@@ -205,7 +205,7 @@ def test_noise_stands_between_the_benchmarks_severities() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coverage, "strips", strips)
         coverage.plot_axis("noise", draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
-    assert set(seen) == {"motion", "gaussian", "zoom", "fog", "glass"}
+    assert set(seen) == {"motion", "gaussian blur", "zoom", "fog", "glass"}
     for kind, severities in seen.items():
         assert len(severities), kind
         assert np.abs(severities - severities.round()).min() >= 0.25, kind
