@@ -69,13 +69,31 @@ def tasks(arguments: argparse.Namespace) -> None:
 def _preview_arguments(command: argparse.ArgumentParser) -> None:
     from pipeline.axes import AXES
 
-    axes = (*AXES, EVERY)
+    axes = ", ".join((*AXES, EVERY))
     command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
-    command.add_argument("axis", choices=axes, metavar="AXIS", help=f"any of {', '.join(axes)}")
+    command.add_argument("axis", type=_axis, metavar="AXIS", help=f"any of {axes}, or several joined by +")
+
+
+def _axis(name: str) -> str:
+    """Return the name of an axis, of several joined by + in their order, or ``all``.
+
+    Raises:
+        ArgumentTypeError: when it names no axis.
+    """
+    from pipeline.axes import axes_of
+
+    if name == EVERY:
+        return name
+    try:
+        return "+".join(axes_of(name))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{error}; or {EVERY}") from error
 
 
 def preview(arguments: argparse.Namespace) -> None:
     """render what an axis does to a task: its first frame, and up to eleven perturbations over components and levels
+
+    Several axes joined by +, such as `camera+noise`, change each picture together, as episodes of a plan do.
 
     With `all`, one strong perturbation on each axis beside the clean twin. A name that ends in .jpg gives JPEG, else
     PNG. Only a picture of an earlier preview is overwritten. Seed, ranges and demonstrations are those of the

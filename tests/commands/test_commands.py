@@ -67,6 +67,7 @@ def test_every_command_is_listed_and_explains_itself(command: list[str], capsys:
         ["regenerate", "ID", "--out", "again", "mine.yaml"],
         ["push", "rlds", "me/x", "--really", "mine.yaml"],
         ["preview", "libero_goal/*", "camera", "--out", "a.png", "mine.yaml"],
+        ["preview", "libero_goal/*", "noise+camera", "--out", "a.png", "mine.yaml"],
         ["preview", "--out", "a.png", "libero_goal/*", "camera", "mine.yaml"],
         ["clean", "--only", "rlds", "mine.yaml", "--yes"],
     ],
@@ -74,6 +75,15 @@ def test_every_command_is_listed_and_explains_itself(command: list[str], capsys:
 )
 def test_the_configuration_is_the_last_argument_whatever_stands_before_it(words: list[str]) -> None:
     assert str(parser().parse_args(words).config) == "mine.yaml"
+
+
+def test_a_preview_names_axes_in_any_order(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["preview", "libero_goal/*", "--out", "a.png"]
+    assert parser().parse_args([*words, "noise+camera"]).axis == "camera+noise"
+    assert parser().parse_args([*words, "all"]).axis == "all"
+    with pytest.raises(SystemExit):
+        parser().parse_args([*words, "noise+cameras"])
+    assert "'noise+cameras' names no axis with 'cameras', expected layout, " in capsys.readouterr().err
 
 
 def test_lists(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
