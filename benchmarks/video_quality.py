@@ -90,7 +90,7 @@ def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Fra
     renderer.close()
     for view, frames in raw.items():
         yield f"{entry.task.suite} {view}", [to_policy(frame) for frame in frames]
-    for component in ("motion", "gaussian", "zoom", "fog", "glass"):
+    for component in ("motion", "gaussian_blur", "zoom", "fog", "glass"):
         effect = getattr(NoiseAxis(), component)[STRONGEST - 1]
         noisy: list[Frame] = []
         for step, frame in enumerate(raw["image"]):

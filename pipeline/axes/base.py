@@ -12,12 +12,12 @@ An axis is a pair of small frozen models in one file. Their class attributes hol
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from enum import IntEnum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Measures, ObservedEpisode, Plot, Strips
 from pipeline.libero.tasks import Same
@@ -172,6 +172,7 @@ class Axis(Frozen):
         test_scene: source of the scenes of these test tasks.
         audited: part of an unlabelled data set that shows the perturbations of the axis.
         not_held_out: reason why evaluations have no held-out perturbations of this axis; empty if they have some.
+        former_fields: former name of a field to its name; configurations may use either.
         levels: strengths to sample, each with equal probability.
     """
 
@@ -182,8 +183,20 @@ class Axis(Frozen):
     test_scene: ClassVar[TestScene] = "libero"
     audited: ClassVar[Literal["instructions", "cameras", "nothing"]] = "nothing"
     not_held_out: ClassVar[str] = ""
+    former_fields: ClassVar[Mapping[str, str]] = {}
 
     levels: Annotated[tuple[Level, ...], Field(min_length=1)] = LEVELS
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rename_former_fields(cls, raw: Any) -> Any:
+        """Give fields with a former name their name."""
+        if not isinstance(raw, Mapping):
+            return raw
+        for former, name in cls.former_fields.items():
+            if former in raw and name in raw:
+                raise ValueError(f"{former} is the former name of {name}: give {name} alone")
+        return {cls.former_fields.get(name, name): value for name, value in raw.items()}
 
     def applies(self, task: Task) -> bool:
         """Return whether the axis can change ``task``; its episodes are spread over all tasks that it can change.
@@ -203,6 +216,11 @@ class Axis(Frozen):
     def entries(self, task: Task) -> Sequence[str]:
         """List the entries that the axis takes its perturbations of a task from; empty if it samples from ranges."""
         return ()
+
+    @property
+    def keeps_clearance(self) -> bool:
+        """Return whether perturbations keep their clearance to the test tasks."""
+        return True
 
     def refuse_tested(self, test: TestSet, task: Task) -> None:
         """Reject levels without any perturbation that keeps its clearance, as far as the ranges show this.

@@ -37,6 +37,18 @@ OPENPI = "pi05_libero"
 OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
 """Path of the statistics below the configuration's assets folder; the configuration reads it to serve a policy."""
 
+EXPORTS = {
+    "openvla_oft": "export: {rlds: {}}",
+    "lerobot_act": "export: {lerobot: {}}",
+    "lerobot_smolvla": "export: {lerobot: {}}",
+    "lerobot_pi05": "export: {lerobot: {}}",
+    "starvla": "export: {lerobot_v21: {convention: ipec}}",
+    "gr00t": "export: {lerobot_v21: {convention: ipec}}",
+    "openpi": "export: {lerobot_v21: {convention: openpi}}",
+    "openpi_serve": "export: {lerobot_v21: {convention: openpi}}",
+}
+"""Client to the setting of a run's configuration that exports the format that it reads."""
+
 MANIFEST = "manifest.parquet of this run"
 
 
@@ -82,13 +94,17 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
 
 
 def _training_and_clients(export: ExportConfig, oft_validates: bool) -> dict[str, Any]:
-    """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``."""
+    """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``.
+
+    Clients whose format is not exported are listed with the setting that exports it.
+    """
     cameras = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), 1)}
     values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
-    return sections
+    missing = {client: setting for client, setting in EXPORTS.items() if client not in sections["clients"]}
+    return {**sections, "clients_of_other_formats": missing} if missing else sections
 
 
 def _filled(template: str, **values: object) -> str:

@@ -32,7 +32,7 @@ _BASE_CLASS = re.compile(r"libero_\w*?_manipulation")
 _SCENE_FILE = re.compile(r".*_table_(?P<surface>.+?)(?:_bg_(?P<wall>.+))?\.xml")
 _NOISE = {
     "motion": ("motion_blur", ("radius_px", "sigma_px")),
-    "gaussian": ("gaussian_blur", ("sigma_px",)),
+    "gaussian_blur": ("gaussian_blur", ("sigma_px",)),
     "zoom": ("zoom_blur", ("max_scale", "copies")),
     "fog": ("fog", ("density", "roughness_decay")),
     "glass": ("glass_blur", ("sigma_px", "delta_px", "passes")),

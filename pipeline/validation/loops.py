@@ -23,7 +23,7 @@ def compile_all() -> None:
     trial()
     frame = np.zeros(SCHEMA.frame.shape, np.uint8)
     axis = NoiseAxis()
-    for levels in (axis.motion, axis.gaussian, axis.zoom, axis.fog, axis.glass):
+    for levels in (axis.motion, axis.gaussian_blur, axis.zoom, axis.fog, axis.glass):
         levels[0].apply(frame, seeding.rng("loops"))
     distance("one wording", "another")
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 import yaml
 from command_words import commands, parse
@@ -91,6 +92,7 @@ def test_a_shell_completes_commands_and_names(words: str, position: int, offered
         ["dataset", "regenerate", "ID", "--out", "again", "mine.yaml"],
         ["dataset", "push", "rlds", "me/x", "--really", "mine.yaml"],
         ["preview", "libero_goal/*", "camera", "--out", "a.png", "mine.yaml"],
+        ["preview", "libero_goal/*", "noise+camera", "--out", "a.png", "mine.yaml"],
         ["preview", "--out", "a.png", "libero_goal/*", "camera", "mine.yaml"],
         ["clean", "--only", "rlds", "mine.yaml", "--yes"],
     ],
@@ -98,6 +100,14 @@ def test_a_shell_completes_commands_and_names(words: str, position: int, offered
 )
 def test_the_configuration_is_the_last_argument_whatever_stands_before_it(words: list[str]) -> None:
     assert parse(words).params["config"] == Path("mine.yaml")
+
+
+def test_a_preview_names_axes_in_any_order() -> None:
+    words = ["preview", "libero_goal/*", "--out", "a.png"]
+    assert parse([*words, "noise+camera"]).params["axis"] == "camera+noise"
+    assert parse([*words, "all"]).params["axis"] == "all"
+    with pytest.raises(click.UsageError, match=r"'noise\+cameras' names no axis with 'cameras', expected layout, "):
+        parse([*words, "noise+cameras"])
 
 
 def test_lists(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

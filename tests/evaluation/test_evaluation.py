@@ -168,7 +168,7 @@ def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: E
 @pytest.mark.slow
 def test_moved_scenes_noise_and_held_out_draws_can_be_seen(evaluated: EpisodeEnvironment) -> None:
     pictures = {}
-    for task in (FIRST, some_test_task("noise", "gaussian"), some_test_task("pose", "pose")):
+    for task in (FIRST, some_test_task("noise", "gaussian_blur"), some_test_task("pose", "pose")):
         evaluated.reset(task)
         evaluated.step(np.zeros(7))
         pictures[task.axis] = evaluated.image("agentview").copy()
@@ -193,7 +193,7 @@ def test_noise_changes_the_views_that_it_names(evaluated: EpisodeEnvironment) ->
     clean = evaluated.observation(Wanted())["images"]
     for kind, noisy in ((NoisePerturbation, "agentview"), (WristNoise, "wrist")):
         evaluated.reset(FIRST)
-        noise = kind(component="gaussian", effect=Gaussian(sigma_px=3), level=1, seed=0)
+        noise = kind(component="gaussian_blur", effect=Gaussian(sigma_px=3), level=1, seed=0)
         evaluated._picture.show(evaluated.simulator.model, (noise,))
         seen = evaluated.observation(Wanted())["images"]
         assert {view for view in clean if not np.array_equal(seen[view], clean[view])} == {noisy}

@@ -199,7 +199,7 @@ def test_noise_stands_between_the_benchmarks_severities() -> None:
     kept = [KeptPerturbation(task, _draw("noise", n), None) for n in range(100)]
     _, (plot,) = AXES["noise"].describe_coverage(kept, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert isinstance(plot, Strips)
-    assert set(plot.rows) == {"motion", "gaussian", "zoom", "fog", "glass"}
+    assert set(plot.rows) == {"motion", "gaussian blur", "zoom", "fog", "glass"}
     for kind, groups in plot.rows.items():
         severities = groups["noise"]
         assert len(severities), kind
