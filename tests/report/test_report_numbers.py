@@ -73,7 +73,9 @@ def test_what_moved_others_farthest_comes_first() -> None:
     for one, far_m in zip(rows, (0.1, 0.3, 0.02), strict=True):
         one["non_target_moved_m"] = far_m
     shown = report._worst(rows, {twin: row(twin, "clean", 9)}, episode)  # type: ignore[arg-type]
-    assert [video.caption for video in shown] == ["30.0 cm", "10.0 cm", "2.0 cm"]
+    farthest_first = [(names[1], "30.0 cm"), (names[0], "10.0 cm"), (names[2], "2.0 cm")]
+    for video, (name, moved) in zip(shown, farthest_first, strict=True):
+        assert f"episode {name}: {moved}" in video.caption
 
 
 def test_a_video_of_an_axis_is_of_its_strongest_episode() -> None:
