@@ -103,7 +103,7 @@ def recorded(task: Task, config: Config) -> Trajectory:
 
 
 def write(path: Path, fields: Mapping[str, Any]) -> None:
-    """Write an HDF5 file with some fields: attributes, such as ``data bddl_file_name``, and data sets."""
+    """Write an HDF5 file with some fields: attributes, such as ``data bddl_file_name``, and datasets."""
     with h5py.File(path, "w") as file:
         for name, value in fields.items():
             node, _, attribute = name.partition(" ")
