@@ -103,7 +103,7 @@ def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
 
     The picture shows the first frame of the task, and up to eleven perturbations over the components and levels of an
     axis. Several axes joined by +, such as camera+noise, change each picture together. With `all`, the picture shows a
-    strong perturbation on each axis next to the clean twin.
+    perturbation of a middle level on each axis next to the clean twin.
 
     An axis that the configuration does not name has default ranges. If FILE ends in .jpg, it is a JPEG, else a PNG.
     Only a picture of an earlier preview is overwritten.

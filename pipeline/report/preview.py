@@ -30,7 +30,7 @@ from pipeline.planning.plan import Draws
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
 from pipeline.rendering.renderer import LastScene, scene_of_process
-from pipeline.report.sheets import Tile, describe, sheet, side_by_side
+from pipeline.report.sheets import Tile, describe, lettering, sheet, side_by_side
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task, Trajectory
@@ -39,6 +39,10 @@ VARIANTS, PHYSICS_VARIANTS = 11, 3
 """With the original, three rows of four; one row of four if each variant is a separate scene to compile."""
 STRIP_STEPS = (0, 6, 16)
 """Control steps after the end of a push that a strip shows, in addition to its first step."""
+AFTER_PUSH_STEPS = 3
+"""Control steps after the end of a push that its picture shows: the hand is furthest from its path then."""
+SHOWN_LEVEL = 3
+"""Level of the perturbations that an overview shows, if it can: visible, and not yet extreme."""
 CANDIDATES = 200
 """Number of the plan's first perturbations, from which the variants are chosen; most take well under a millisecond."""
 
@@ -74,7 +78,8 @@ class Stage:
         if push is None:
             state = first_look(scene, self.demo.task, self.replay)
         else:
-            state = roll_out(scene, self.demo, self.replay)[push.first_step + push.steps]
+            states = roll_out(scene, self.demo, self.replay)
+            state = states[min(push.first_step + push.steps + AFTER_PUSH_STEPS, len(states) - 1)]
         streams = [Stream(view, perturbations) for view in views]
         return frames_of(renderer, state, renderer.site_alpha, streams, 0)
 
@@ -259,7 +264,8 @@ def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
 def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     """Render one sheet of all axes: the agent view of the clean twin, then one perturbation of each axis that applies.
 
-    For each axis, it is the strongest of the plan's first perturbations that is possible in the scene.
+    For each axis, it is the perturbation of the plan's first ones that is possible in the scene and nearest to level
+    ``SHOWN_LEVEL``. A rewritten instruction is printed in place of an unchanged view.
 
     Args:
         test: the benchmark's test tasks, to which the plan's perturbations keep a clearance.
@@ -271,12 +277,12 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
         without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, [name], test)
         if axis.applies(demo.task) and not without_rewrites:
             drawn = variants(name, axis, demo, config.plan.seed, test)
-            tiles.append(_strongest(stage, drawn) if drawn else _nothing_drawn(name))
+            tiles.append(_typical(stage, drawn) if drawn else _nothing_drawn(name))
     return sheet(f"{demo.task}: first frame of the agent view, one draw of each axis", tiles, 5)
 
 
-def _strongest(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
-    for perturbation in sorted(drawn, key=lambda p: -p.level):
+def _typical(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
+    for perturbation in sorted(drawn, key=lambda p: (abs(p.level - SHOWN_LEVEL), -p.level)):
         caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
         try:
             (frame,) = stage.frames(["image"], perturbation)
@@ -284,7 +290,7 @@ def _strongest(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
             last = refused, caption
         else:
             for text in of_layer((perturbation,), TextPerturbation):
-                caption += f": {text.apply(stage.demo.task.instruction)}"
+                return Tile(lettering(text.apply(stage.demo.task.instruction), SIDE_PX[1]), caption)
             return Tile(Image.fromarray(frame), caption)
     return _refused(*last)
 

@@ -298,10 +298,10 @@ def test_the_command_shows_all_axes_beside_the_twin(tmp_path: Path, monkeypatch:
     assert [np.abs(tile - twin).mean() > 2 for tile in (layout, pose)] == [True, True]
 
 
-def test_an_overview_shows_the_strongest_draw_that_the_scene_takes(
+def test_an_overview_shows_a_draw_of_a_middle_level_that_the_scene_takes(
     stage: preview.Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(1, 2, 5)))
+    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(1, 5)))
     monkeypatch.setattr(preview, "PHYSICS_VARIANTS", 6)
     captions: list[str] = []
 
@@ -312,8 +312,8 @@ def test_an_overview_shows_the_strongest_draw_that_the_scene_takes(
     monkeypatch.setattr(preview, "Tile", tile)
     preview.overview(stage, STARTER, NO_TESTS)
     assert captions[0] == f"clean twin: {BOWL.instruction}"
-    # Level 5 is refused.
-    assert captions[1:] == ["lift: lamp, level 2"] * len(Axes.model_fields)
+    # Levels 1 and 5 are as far from 3; level 5, which comes first, is refused.
+    assert captions[1:] == ["lift: lamp, level 1"] * len(Axes.model_fields)
     monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(5,)))
     captions.clear()
     preview.overview(stage, STARTER, NO_TESTS)
