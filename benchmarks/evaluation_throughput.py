@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from model_server import replaying
+from server_process import replaying
 
 from pipeline.libero.tasks import find_task
 from pipeline.machine_code import ensure_fixed_machine_code

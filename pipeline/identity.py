@@ -71,7 +71,7 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
     "pictures": ("robouse",),
 }
 
-DISTRIBUTION = "perturbed-demos"
+DISTRIBUTION = "perturbed-libero"
 """Name of this project among installed packages; on PyPI, ``pipeline`` is another project."""
 
 REMAKE = "REMAKE"

@@ -25,7 +25,7 @@ MACHINE_CODE_VARIABLES = {
 }
 """Environment variables of OpenBLAS and NumPy."""
 
-STARTED_AGAIN = "PERTURBED_DEMOS_STARTED_AGAIN"
+STARTED_AGAIN = "PERTURBED_LIBERO_STARTED_AGAIN"
 """Environment variable with the id of the process that has started itself again."""
 
 FIXED = "Haswell AVX2"

@@ -12,7 +12,7 @@ from conftest import REPOSITORY
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("benchmarks/*.md")])
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
-COMMAND = re.compile(r"(?:\S*python -m pipeline|perturbed-demos) (.*)")
+COMMAND = re.compile(r"(?:\S*python -m pipeline|perturbed-libero) (.*)")
 
 
 def anchors(page: Path) -> set[str]:

@@ -56,7 +56,7 @@ print(len([name for name in sys.modules if name.startswith("pipeline.")]))
     "program",
     [
         ["-m", "pipeline", "tasks", "--help"],
-        [SCRIPTS / "perturbed-demos", "tasks", "--help"],
+        [SCRIPTS / "perturbed-libero", "tasks", "--help"],
         [REPOSITORY / "stages" / "plan.py", "--help"],
         [REPOSITORY / "benchmarks" / "disk.py", "--help"],
     ],

@@ -88,8 +88,8 @@ class Work:
         """Evaluate a policy; write its results into the folder ``kept``, to be committed, and return the file."""
         self.train(arm, seed)
         import evaluation
-        from model_server import running
         from results import PolicyResults
+        from server_process import running
 
         policy = self.policy(arm, seed)
         weights = checksum(policy / "model.safetensors")

@@ -19,7 +19,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
 from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.policies import Policy
+from pipeline.evaluation.policies import Policy, warn_of_single_view
 from pipeline.evaluation.results import one_setting
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
 from pipeline.evaluation.selection import Selection, select
@@ -71,6 +71,9 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     faults: dict[EvaluationTask, str] = {}
     missing = [task for task in selected if evaluation.result(task) is None]
     if missing:
+        if policy.kind == "server":
+            # Each worker connects for itself. This connection warns once, before the workers start.
+            warn_of_single_view(policy.address, policy.timeout_s)
         device = gl.choose().device
         jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _jobs(missing, workers)]
         work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)

@@ -1,8 +1,9 @@
 """Policies: their interface, and policies behind a model server or in a lerobot checkpoint."""
 
 import asyncio
+import logging
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -88,6 +89,10 @@ class NextLook:
         self.left = (self.left or self._every) - 1 if np.ndim(actions) == 1 else 0
 
 
+REQUESTS = ("send_wrist_image", "send_state")
+"""Parameters of vla-eval by which a model server asks for the wrist view and for the state, or leaves them out."""
+
+
 class Server:
     """Model server of vla-eval. It is asked at every step, or once per chunk if it answers with chunks.
 
@@ -98,6 +103,9 @@ class Server:
         address: address of the server, such as ``ws://localhost:8000``.
         timeout_s: time limit of an answer.
         look_every: number of control steps between two observations, see ``NextLook``.
+
+    Attributes:
+        states_request: the server announces one of ``REQUESTS``, also if its value is false.
 
     Raises:
         PipelineError: if no server answers at the address, or if its actions cannot be executed.
@@ -171,6 +179,7 @@ class Server:
             ) from error
         announced = self._connection.server_info
         wanted = announced.get("observation_params") or {}
+        self.states_request = any(name in wanted for name in REQUESTS)
         try:
             refuse_other_actions(wanted, announced.get("action_spec") or {}, self.name)
         except PipelineError:
@@ -201,6 +210,27 @@ class Server:
         """Close the connection, and return an error."""
         self._loop.run_until_complete(self._connection.close())
         return PolicyError(what, where=self.name, remedy="see the server's log")
+
+
+def warn_of_single_view(address: str, timeout_s: float) -> None:
+    """Log a warning if a server announces none of ``REQUESTS``, because its author may have forgotten to ask.
+
+    Args:
+        address: address of the server, such as ``ws://localhost:8000``.
+        timeout_s: time limit of an answer.
+
+    Raises:
+        PipelineError: as ``Server``.
+    """
+    with closing(Server(address, timeout_s)) as server:
+        if not server.states_request:
+            logging.getLogger(__name__).warning(
+                "%s announces neither %s: its policy receives only the agent view and the instruction. If the policy "
+                "uses the wrist view or the state, return these parameters from get_observation_params; a value of "
+                "False silences this warning (docs/model-server.md)",
+                address,
+                " nor ".join(REQUESTS),
+            )
 
 
 class Checkpoint:

@@ -124,11 +124,11 @@ class Format(ABC, Generic[Options]):
     title: ClassVar[str]
     """Name for people, and the hub's tag."""
     options_type: ClassVar[type[FormatOptions]]
-    """Model of its options, the field ``name`` of the section ``export``; the class ``Options`` of the type."""
+    """Model of its options, which are a field of the section ``export`` under the format's name."""
     by_default: ClassVar[bool] = False
     """True if a run writes the format unless its configuration says ``null``."""
     recipe: ClassVar[int]
-    """Recipe number (see ``pipeline/identity.py``); the commit that raised it describes the change."""
+    """Recipe number (see ``pipeline/identity.py``); 1 for a new format."""
     packages: ClassVar[tuple[str, ...]]
     """Packages that compute the bytes of the files."""
     group: ClassVar[str]

@@ -73,15 +73,15 @@ def test_a_moved_command_names_its_new_place(
 @pytest.mark.parametrize(
     ("words", "position", "offered"),
     [
-        ("perturbed-demos sta", 1, {"status"}),
-        ("perturbed-demos dataset ", 2, {"check", "audit", "regenerate", "push"}),
-        ("perturbed-demos preview TASK c", 3, {"camera"}),
-        ("perturbed-demos clean --only t", 3, {"trajectories", "tables"}),
+        ("perturbed-libero sta", 1, {"status"}),
+        ("perturbed-libero dataset ", 2, {"check", "audit", "regenerate", "push"}),
+        ("perturbed-libero preview TASK c", 3, {"camera"}),
+        ("perturbed-libero clean --only t", 3, {"trajectories", "tables"}),
     ],
 )
 def test_a_shell_completes_commands_and_names(words: str, position: int, offered: set[str]) -> None:
-    asked = {"_PERTURBED_DEMOS_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": str(position)}
-    command = [str(SCRIPTS / "perturbed-demos")]
+    asked = {"_PERTURBED_LIBERO_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": str(position)}
+    command = [str(SCRIPTS / "perturbed-libero")]
     done = subprocess.run(command, env={**IN_SCRIPTS, **asked}, capture_output=True, text=True, check=False)
     assert {line.partition(",")[2] for line in done.stdout.splitlines()} == offered
 

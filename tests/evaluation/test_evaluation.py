@@ -15,7 +15,7 @@ import pytest
 from conftest import REPOSITORY, STOVE
 from episode_results import result
 from libero_environment import OffScreenRenderEnv, transform
-from model_server import replaying
+from server_process import replaying
 from vla_eval.rotation import quat_to_axisangle
 
 from pipeline.__main__ import main

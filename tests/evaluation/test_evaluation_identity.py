@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import STOVE
 from episode_results import result
-from model_server import running
+from server_process import running
 
 from pipeline import identity
 from pipeline.axes.camera import CameraAxis, SphericalRange

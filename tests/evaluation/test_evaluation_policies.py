@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from anyio.from_thread import start_blocking_portal
 from conftest import REPOSITORY
-from model_server import running
+from server_process import running
 from vla_eval.model_servers.base import ModelServer
 from vla_eval.model_servers.groot import GR00TModelServer
 from vla_eval.model_servers.serve import serve_async

@@ -11,7 +11,7 @@ from typing import Any
 import libero_environment  # noqa: F401 - robosuite with OpenGL, for the harness's classes
 import pytest
 from conftest import REPOSITORY, STOVE
-from model_server import running
+from server_process import running
 from vla_eval.connection import Connection
 from vla_eval.runners.sync_runner import SyncEpisodeRunner
 

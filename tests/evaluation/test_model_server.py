@@ -1,0 +1,177 @@
+"""docs/model-server.md is true: its server runs, receives what the tables state, and is warned if it does not ask."""
+
+import json
+import logging
+import re
+import runpy
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from anyio.from_thread import start_blocking_portal
+from conftest import REPOSITORY, STOVE
+from server_process import running
+from vla_eval.model_servers.base import ModelServer
+from vla_eval.model_servers.serve import serve_async
+
+from pipeline.__main__ import main
+from pipeline.compute.pool import loop
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.harness import ReplayServer
+from pipeline.evaluation.policies import Server, warn_of_single_view
+from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
+from pipeline.evaluation.selection import Selection
+from pipeline.evaluation.tasks import libero_task
+
+EXAMPLE = REPOSITORY / "examples" / "model_server.py"
+PAGE = (REPOSITORY / "docs" / "model-server.md").read_text()
+CLOSED_EYES: type[Any] = runpy.run_path(str(EXAMPLE))["ClosedEyes"]
+
+
+class Serve:
+    """Servers in threads of this process; a call starts a server and returns its address."""
+
+    def __init__(self, portal: Any):
+        self._portal = portal
+
+    def __call__(self, server: ModelServer) -> str:
+        _, port = self._portal.start_task(serve_async, server, "127.0.0.1", 0)
+        return f"ws://127.0.0.1:{port}"
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    with start_blocking_portal() as portal:
+        yield Serve(portal)
+        portal.call(portal.stop, True)
+
+
+class Recorder(CLOSED_EYES):  # type: ignore[misc]
+    """The server of the page, which also keeps what it receives."""
+
+    def __init__(self, **place_m: float):
+        super().__init__(**place_m)
+        self.observations: list[dict[str, Any]] = []
+        self.messages: list[dict[str, Any]] = []
+
+    def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
+        self.observations.append(obs)
+        answer: dict[str, Any] = super().predict(obs, ctx)
+        return answer
+
+    async def on_episode_start(self, config: dict[str, Any], ctx: Any) -> None:
+        self.messages.append(config)
+        await super().on_episode_start(config, ctx)
+
+    async def on_episode_end(self, result: dict[str, Any], ctx: Any) -> None:
+        self.messages.append(result)
+        await super().on_episode_end(result, ctx)
+
+
+class Asking(ReplayServer):
+    """A server with other observation parameters."""
+
+    def __init__(self, **params: bool):
+        super().__init__(chunk=8)
+        self._params = params
+
+    def get_observation_params(self) -> dict[str, Any]:
+        return self._params
+
+
+def rows_of(heading: str) -> dict[str, list[str]]:
+    """The cells of the table under a heading of the page, by their first cell without marks of code."""
+    section = PAGE.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line[:1] == "|"]
+    return {cells[0].strip("`"): cells[1:] for cells in rows[2:]}
+
+
+def test_the_page_shows_the_example() -> None:
+    (block,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    assert block in EXAMPLE.read_text()
+    assert block.startswith("class ClosedEyes")
+    assert "run_server(ClosedEyes)\n" in block
+
+
+@pytest.mark.slow
+def test_the_server_receives_what_the_table_states_and_moves_the_hand_there(serve: Serve) -> None:
+    server = Recorder(x_m=0.05, y_m=-0.1, z_m=1.15)
+    task = libero_task(STOVE, 0)
+    with closing(EpisodeEnvironment(EpisodeSettings())) as environment, closing(Server(serve(server))) as policy:
+        environment.reset(task)
+        policy.begin(task)
+        while len(server.observations) < 15:
+            for action in policy.act(environment.observation):
+                environment.step(action)
+        policy.end(False)
+    *_, last = server.observations
+    table = rows_of("Observations")
+    parts = {
+        'obs["images"]["agentview"]': last["images"]["agentview"],
+        'obs["images"]["wrist"]': last["images"]["wrist"],
+    }
+    for name, part in {**parts, 'obs["states"]': last["states"]}.items():
+        assert table[name][0] == f"{part.shape} {part.dtype}", name
+    assert last["task_description"] == "turn on the stove"
+    assert {*table} == {*parts, 'obs["states"]', 'obs["task_description"]'}
+    assert {*last} == {"images", "states", "task_description"}
+    np.testing.assert_allclose(last["states"][:3], [0.05, -0.1, 1.15], atol=0.01)
+    start, end = server.messages
+    assert start["task"] == task.for_harness()
+    assert end == {"metrics": {"success": False}}
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_page_evaluate_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As they stand, but with the free port of the test and another folder."""
+    (command,) = re.findall(r"^python -m (pipeline evaluate .*)$", PAGE.replace("\\\n", " "), re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    with running(str(EXAMPLE)) as address:
+        monkeypatch.setattr(sys, "argv", shlex.split(command.replace("ws://127.0.0.1:8000", address)))
+        assert main() in (None, 0)
+    told = capsys.readouterr()
+    assert "announces neither" not in told.err
+    assert json.loads(told.out.splitlines()[-1])["all"]["episodes"] == 1
+    (row,) = EpisodeFiles(tmp_path / "results" / "closed_eyes").rows()
+    assert (row.base, row.reason, row.steps, row.looks) == ("turn_on_the_stove", "step_limit", 300, 30)
+    assert (row.settings["wrist"], row.settings["state"], row.settings["shortest_rotation"]) == (True, True, False)
+
+
+@pytest.mark.parametrize(
+    ("params", "warned"),
+    [
+        ({}, True),
+        ({"quat_no_antipodal": True}, True),
+        ({"send_state": False}, False),
+        ({"send_wrist_image": True}, False),
+    ],
+)
+def test_a_server_that_does_not_ask_is_warned_of(
+    params: dict[str, bool], warned: bool, serve: Serve, caplog: pytest.LogCaptureFixture
+) -> None:
+    address = serve(Asking(**params))
+    warn_of_single_view(address, timeout_s=10)
+    told = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(told) == warned
+    for message in told:
+        assert message.startswith(f"{address} announces neither send_wrist_image nor send_state")
+        assert "only the agent view" in message
+
+
+@pytest.mark.slow
+def test_an_evaluation_warns_once(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    policy = PolicyConfig(kind="server", address=serve(Asking()), label="silent")
+    settings = EpisodeSettings(initial_states="demonstration")
+    chosen = Selection(suites=("libero_goal",), tasks=("turn_on*", "put_the_bowl_on_the_plate"))
+    evaluation = Evaluation(settings, policy, policy.identity(), tmp_path)
+    assert evaluate(evaluation, chosen, loop)["all"]["successes"] == 2
+    assert sum("announces neither" in record.getMessage() for record in caplog.records) == 1
