@@ -35,7 +35,7 @@ FIXED = "Haswell AVX2"
 def ensure_fixed_machine_code(variables: Mapping[str, str] = MACHINE_CODE_VARIABLES) -> None:
     """Start this program again with the same arguments, unless the environment already has the variables.
 
-    The first statement of a program calls this. Where it starts the program again, it does not return: the new program
+    The first statement of a program calls this. If it starts the program again, it does not return: the new program
     replaces this process. Code that calls a program from within, such as a notebook, sets the variables itself.
 
     Args:

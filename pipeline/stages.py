@@ -159,7 +159,7 @@ def replay(run: Run) -> None:
 def render(run: Run) -> None:
     """Render the frames of every kept episode from the stored states. Resumes where it was stopped.
 
-    Where frames are rejected, the reserves that take their place are replayed, as in the stage replay.
+    If frames are rejected, the reserves that take their place are replayed, as in the stage replay.
     """
     print(gl.choose())
     rows, config = run.plan, run.config

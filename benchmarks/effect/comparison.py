@@ -122,7 +122,7 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     if rows:
         text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n"
         text += _table(rows)
-    text += "\nHow often its goal is reached, and others by name, by what the policy is told:\n\n"
+    text += "\nEpisodes that reach the goal of the instruction, and other reached goals by name:\n\n"
     return text + _table(_reading_rows(results))
 
 

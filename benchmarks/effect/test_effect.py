@@ -104,7 +104,7 @@ def test_an_arm_or_a_seed_that_there_is_not_is_refused(shipped: Experiment) -> N
 
 
 def test_all_sentences_of_the_experiment_have_embeddings_that_tell_tasks_apart(shipped: Experiment) -> None:
-    """As all-MiniLM-L6-v2 makes them: of unit length, and nine rewrites in ten nearest to their own instruction."""
+    """Vectors of all-MiniLM-L6-v2 have unit length, and nine rewrites in ten are nearest to their own instruction."""
     vectors = sentences.read()
     used = sentences.used(shipped.tasks)
     assert "" in used
@@ -145,7 +145,7 @@ def test_a_task_without_embeddings_is_refused_before_any_work(tmp_path: Path) ->
 
 
 def demonstrations(experiment: Experiment, number: int) -> list[DemoEntry]:
-    """Of each task so many, which nobody recorded."""
+    """Return so many demonstrations of each task, which nobody recorded."""
     starter = StarterSource().index([find_task(*name.split("/")) for name in experiment.tasks]).entries
     return [
         replace(entry, key=f"demo_{place}", sha256=f"{entry.sha256}{place}")
@@ -257,7 +257,7 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, mo
 
 @pytest.fixture
 def command() -> Iterator[ModuleType]:
-    """What ``python benchmarks/effect`` runs, in this process, which keeps its environment for the next evaluation."""
+    """Yield the module of ``python benchmarks/effect``; this process keeps its environment for the next evaluation."""
     spec = spec_from_file_location("effect_command", EFFECT / "__main__.py")
     assert spec is not None
     assert spec.loader is not None

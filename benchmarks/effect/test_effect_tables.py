@@ -1,4 +1,4 @@
-"""What the experiment's tables say: rows as they were written, paired differences, exact p-values, and the pages."""
+"""Tables of the experiment: rows as they were written, paired differences, exact p-values, and the pages."""
 
 import json
 from dataclasses import replace
@@ -27,7 +27,7 @@ def row(axis: str, number: int, success: bool, policy: str) -> EpisodeResult:
 
 
 def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
-    """Of ten tasks of each axis the first ``solved`` are solved; of two instructions the first is followed."""
+    """Return results: of each axis the first ``solved`` of ten tasks, and one of two instructions, are solved."""
     rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in comparison.LINE_OF for number in range(10)]
     told = [("turn on the stove", "stove"), ("put the bowl on the plate", None), ("", "stove")]
     reading = [{"state": 0, "instruction": text, "reached": goal, "steps": 9} for text, goal in told]
@@ -71,12 +71,12 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
 
 
 def test_holms_correction() -> None:
-    """By hand: 0.01 x 4, then 0.02 x 3, then 0.03 x 2, no less than the one before; 0.9 and more stay."""
+    """Computed by hand: 0.01 x 4, then 0.02 x 3, then 0.03 x 2, no less than the one before; 0.9 and more stay."""
     assert comparison.holm([0.03, 0.01, 1.0, 0.02]) == pytest.approx([0.06, 0.04, 1.0, 0.06])
 
 
 def test_p_is_exact_where_few_tests_differ() -> None:
-    """Of five tests that all favour one arm, two of the 2^5 signs say as much. SciPy permutes the arms of each test."""
+    """Two of the 2^5 signs are as extreme as five tests that favour one arm. SciPy permutes the arms of each test."""
     clean = [of_policy("clean", seed, 4) for seed in (0, 1)]
     found = comparison.differences([*clean, *(of_policy("ours", seed, 9) for seed in (0, 1))])
     assert next(one for one in found if one["line"] == "robot")["p_value"] == 2 / 2**5

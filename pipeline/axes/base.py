@@ -65,8 +65,8 @@ class Credit(NamedTuple):
 TestScene = Literal["libero", "bddl", "bddl and models", "scene files"]
 """Source of the scenes of an axis's test tasks.
 
-It is LIBERO's own task, a BDDL file of the benchmark, such a file with models of the benchmark's asset archive, or
-scene files of this archive in place of LIBERO's."""
+The scene of LIBERO's own task is ``libero``. The others are a BDDL file of the benchmark, such a file with models of
+the benchmark's asset archive, and scene files of this archive in place of LIBERO's."""
 
 
 class Perturbation(Frozen):
@@ -132,7 +132,7 @@ class Perturbation(Frozen):
     def apart(self, others: Sequence[Self]) -> Floats:
         """Return the distances (N,) to N perturbations of this class, in the measure of ``distances``.
 
-        A distance is NaN if the two cannot be compared. By default it is 0 to an equal perturbation, else 1.
+        A distance is NaN if the two cannot be compared. The default is 0 to an equal perturbation, else 1.
 
         Args:
             others: at least one perturbation, all for the ``same`` task or scene; results of ``in_scene`` if their

@@ -238,9 +238,9 @@ class AsideRange(Frozen):
     Attributes:
         elevation_deg: to either side of the test set's elevations, 0 and 15.
         distance_scale: to either side of the nominal distance, which all test cameras but the dollies keep. A smaller
-            turn than the clearance at one of the dollies' distances is drawn anew.
-        turn_deg: angle of a turn in place, in any direction. Of a camera that moved around the scene it is a yaw: the
-            pitch is about the world's y axis, so there it would roll the camera, as in no test task.
+            turn than the clearance at one of the dollies' distances is sampled again.
+        turn_deg: angle of a turn in place, in any direction. A camera that moved around the scene turns by a yaw: the pitch is
+            about the world's y axis, so there it would roll the camera, as in no test task.
     """
 
     elevation_deg: Angles = ((-8.0, -5.1), (5.1, 9.9))
@@ -289,7 +289,7 @@ class CameraAxis(Axis):
     """The ranges to draw from: each component spans what LIBERO-Plus's test cameras of its kind do.
 
     There every value is taken, so a draw changes something else as well, which keeps it 5 degrees from all of them:
-    a distance of 1.6 with 6 degrees of elevation is clear. What the defaults show was looked at in all five arenas.
+    a distance of 1.6 with 6 degrees of elevation is clear. Frames of the defaults were looked at in all five arenas.
 
     Attributes:
         components: which of them, each as often as the others.
@@ -297,7 +297,7 @@ class CameraAxis(Axis):
             leaves a configured range, and cameras of other suites have no test cameras to keep away from.
             ``second_change`` changes another one of ``components`` as well, within its ranges. ``resample`` only
             samples again, which needs ranges that the test cameras leave free. ``off`` keeps no clearance:
-            ``leakage.json`` counts the overlaps, and the run goes on.
+            ``leakage.json`` counts the overlaps, and the run continues.
         aside: ranges of the second change, as far as they are in the ranges of its component.
     """
 

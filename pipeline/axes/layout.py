@@ -119,9 +119,9 @@ class LayoutAxis(Axis):
     """Number and sources of added objects.
 
     The level is the number of objects, 1 to 5 as in LIBERO-Plus. An object is never of a category that is in the scene
-    already or that the instruction names, nor of one that the test set adds. The same model may come twice, two models
-    of one category never: a scene's objects are drawn with replacement from ``SHELF`` models of different categories,
-    because that is how often LIBERO-Plus repeats its 13 (in 6, 21, 42 and 60 % of its scenes with 2, 3, 4 and 5).
+    already or that the instruction names, nor of one that the test set adds. The same model may come twice, but two
+    models of one category never do. A scene's objects are sampled with replacement from ``SHELF`` models of different
+    categories. LIBERO-Plus repeats its 13 models as often: in 6, 21, 42 and 60 % of its scenes with 2, 3, 4 and 5.
 
     Attributes:
         sources: ``libero`` and ``robosuite`` are installed; ``sweethome3d`` (fetched by apt-get, 120 MB) and folders of

@@ -144,8 +144,8 @@ def _range(dim: tuple[float, float], bright: tuple[float, float], *others: tuple
 class LightAxis(Axis):
     """The ranges to draw from, chosen by looking at all arenas: from just noticeable to as far as all still shows.
 
-    Noticeable: of the agent view's pixels, 5 % differ by 8 grey levels or more. So it was at levels 1 and 5 of every
-    component in every arena, twelve draws each (see docs/axes.md).
+    Noticeable: of the agent view's pixels, 5 % differ by 8 grey levels or more. This holds at levels 1 and 5 of every
+    component in every arena, for twelve samples each (see docs/axes.md).
 
     Attributes:
         components: which of them. ``shadows`` turns the lamps, too. ``combined`` changes diffuse light, direction and

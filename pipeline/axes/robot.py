@@ -153,10 +153,10 @@ class RobotAxis(Axis):
     """Offsets in all directions with equal chance.
 
     Attributes:
-        components: what to draw, each entry as often as the others. By default three of four are the benchmark's.
+        components: what to sample, each entry equally often. Three of four default entries are the benchmark's.
         norm_rad: the norm of a controller's posture at each level; the defaults are the benchmark's.
-        initial_norm_rad: the same of initial joints. Of the defaults nine of ten starts are within 10 cm of the hand's
-            unchanged first observation, as nearly all robot tests are; at the benchmark's norms half were further away.
+        initial_norm_rad: the same of initial joints. At the defaults, nine of ten starts are within 10 cm of the hand's
+            unchanged first observation, as nearly all robot tests are. At the benchmark's norms half were further away.
     """
 
     draws: ClassVar = (RobotPerturbation,)

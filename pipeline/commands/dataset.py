@@ -65,9 +65,9 @@ def check(config: Path) -> int:
 def audit(dataset: Path, manifest: Path | None) -> int:
     """Measure how close a dataset comes to the test tasks of the benchmark.
 
-    The instruction of every episode is compared, and also the matrices of its agent view and the labels of this
-    project if the dataset has them, even after it was edited, merged or filtered. Episodes that cannot be compared are
-    counted. The last line is JSON. The exit status is 1 if an episode overlaps with a test task.
+    The instruction of every episode is compared. Matrices of the agent view and labels of this project are compared
+    if the dataset has them, even after it was edited, merged or filtered. Episodes that cannot be compared are counted.
+    The last line is JSON. The exit status is 1 if an episode overlaps with a test task.
     """
     from dataclasses import asdict
 

@@ -70,7 +70,7 @@ def fetch(out: Path, suites: tuple[str, ...], endpoint: str | None) -> None:
 def expand(out: Path, per_task: int, tasks: tuple[str, ...], starts: Literal["wide", "reset"], seed: int) -> int:
     """Generate many demonstrations of each task from the starter set's single one.
 
-    Each human demonstration is replayed from other starts. Those that reach the goal are written in LIBERO's own HDF5
+    Each human demonstration is replayed from other starts. Replays that reach the goal are written in LIBERO's own HDF5
     layout (states, actions and scenes; no images). They are marked as expanded in the files and in every dataset
     generated from them. This needs no network. The last line is JSON.
     """

@@ -284,8 +284,8 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     """Read the folders that ``evaluate`` wrote; an episode in several folders counts once.
 
     Raises:
-        PipelineError: if a folder has no results, results cannot be compared, two results of an episode differ, a task
-            has two episodes under the same settings, or two policies have one name.
+        PipelineError: if a folder has no results, or results cannot be compared. Results of an episode must not differ,
+            a task has one episode under the same settings, and policies have different names.
     """
     results = stored(folders)
     refuse_shared_names((row.policy, row.identity, files.folder) for row, files in results)

@@ -142,7 +142,7 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
 
     The index along the route advances by one a step, so grasp and release keep their timing. It advances more slowly
     while the hand is far from its wanted pose. A carried object may have been grasped differently than in the
-    reference. So while an object is carried, the object, not the hand, is brought to its place in the reference.
+    reference. While an object is carried, the object instead of the hand is brought to its place in the reference.
 
     Args:
         route: the route.

@@ -219,7 +219,7 @@ def _motion(store: TrajectoryStore, trajectory_id: str, task: Task) -> _Motion:
 def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
     """Convert a replay to a recording in LIBERO's layout, with its origin, but without images and this machine's paths.
 
-    As in LIBERO's files, states precede each action, and observations follow it.
+    States precede each action, and observations follow it, as in LIBERO's files.
     """
     compiled = CompiledScene(Scene(trajectory.model_xml, trajectory.states[0]))
     robot, hands, joints = [], [], []

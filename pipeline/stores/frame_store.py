@@ -47,9 +47,9 @@ class StoredFrames:
 class FrameStore(Store):
     """Frames under one folder.
 
-    The columns of its table are ``device`` (OpenGL name of the device that rendered), ``replay_mode``, ``steps``,
-    ``streams`` (ids of the rendered streams) and ``rejected`` (JSON, id of each rejected stream to the reason). A
-    file's name is ``<trajectory id>/<digest of its streams>``.
+    The columns of its table are ``device`` (OpenGL name of the device that rendered), ``replay_mode``, ``steps`` and
+    ``streams`` (ids of the rendered streams). The column ``rejected`` is JSON, the id of each rejected stream to the
+    reason. A file's name is ``<trajectory id>/<digest of its streams>``.
 
     Frames that were encoded with another ``render_config`` count as missing.
     """

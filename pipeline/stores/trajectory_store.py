@@ -18,9 +18,9 @@ from pipeline.types import Push, Quality, Scene, Trajectory, Verdict
 class TrajectoryStore(Store):
     """Trajectories under one folder.
 
-    The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (origin of the actions), ``steps``
-    (number of executed actions), ``resolved`` (JSON of the effects of physics perturbations in the scene), and the
-    columns of ``Quality``.
+    The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (origin of the actions) and ``steps``
+    (number of executed actions). Further columns are ``resolved`` (JSON of the effects of physics perturbations in the
+    scene) and those of ``Quality``.
 
     A file holds no path of the machine. Its bytes therefore do not depend on where the packages are installed, and
     every machine can read it.

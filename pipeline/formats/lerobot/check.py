@@ -446,7 +446,7 @@ def _wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[An
     """Compare a camera's statistics over all frames with the statistics of the episodes.
 
     Mean, deviation and range follow from the episodes. A quantile must be between the least and the largest quantile of
-    the episodes. Where the episodes state none, as in version 2.1, it must be within the bounds of Cantelli's
+    the episodes. If the episodes state none, as in version 2.1, it must be within the bounds of Cantelli's
     inequality. Nothing is compared if statistics are missing; ``_wrong_in_dataset`` reports that.
 
     Args:

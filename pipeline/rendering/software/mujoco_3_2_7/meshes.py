@@ -40,8 +40,8 @@ class Meshes:
     has its own second lists, so one call of ``mjr_render`` can render different meshes in each pass. An extra mesh is
     the last mesh of every pass (:meth:`show`). It writes underlays and sets the list base for the next pass.
 
-    MuJoCo renders skins in the world's frame. So the list of a mesh with a skin pushes the mesh's matrix onto OpenGL's
-    stack. An extra mesh after the skin, the closing mesh, pops the matrix.
+    MuJoCo renders skins in the world's frame. The list of a mesh with a skin therefore pushes the mesh's matrix onto
+    OpenGL's stack. An extra mesh after the skin, the closing mesh, pops the matrix.
 
     Attributes:
         model: the meshes' model.
