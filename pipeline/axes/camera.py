@@ -239,8 +239,8 @@ class AsideRange(Frozen):
         elevation_deg: to either side of the test set's elevations, 0 and 15.
         distance_scale: to either side of the nominal distance, which all test cameras but the dollies keep. A smaller
             turn than the clearance at one of the dollies' distances is sampled again.
-        turn_deg: angle of a turn in place, in any direction. A camera that moved around the scene turns by a yaw: the pitch is
-            about the world's y axis, so there it would roll the camera, as in no test task.
+        turn_deg: angle of a turn in place, in any direction. A camera that moved around the scene turns by a yaw.
+            Its pitch is about the world's y axis and would roll the camera, as in no test task.
     """
 
     elevation_deg: Angles = ((-8.0, -5.1), (5.1, 9.9))

@@ -15,7 +15,7 @@ class ControlStep:
     A substep of robosuite runs MuJoCo's whole forward dynamics three times on one state: before the controller, inside
     the controller's update, and inside ``mj_step``. Two results can differ between the three runs. The solver starts
     from its last result. Once torques are set, the quantities that depend on them change. The second run is therefore
-    the constraint solver alone here, and the third run is ``mj_step2``. No solve can be left out: each solve changes the
+    the constraint solver alone, and the third run is ``mj_step2``. No solve can be left out: each solve changes the
     start of the next by very little, and contacts amplify this to decimetres before a demonstration ends.
 
     Only one part of ``mj_step`` is missing: its check for positions and velocities beyond 1e10. The check of
