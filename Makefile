@@ -1,6 +1,6 @@
 # Short names for setup.sh, which works where make is not installed.
 
-.PHONY: setup run quick test doctor lock sbom
+.PHONY: setup run quick test doctor site lock sbom
 
 setup:
 	bash setup.sh
@@ -18,6 +18,10 @@ doctor: setup
 	.venv/bin/python -m pipeline doctor configs/starter.yaml
 
 # pynput and evdev are left out: only lerobot's keyboard teleoperation needs them, and evdev takes a compiler.
+# The documentation in site/index.html, with search.
+site: setup
+	.venv/bin/python -m mkdocs build --strict
+
 lock: setup
 	UV_CUSTOM_COMPILE_COMMAND="make lock" .venv/bin/uv pip compile --quiet --universal --python-version 3.11 \
 		pyproject.toml --group dev --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
