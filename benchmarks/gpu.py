@@ -130,7 +130,7 @@ def _render(folder: Path, name: str, seconds: float) -> Rendered:
             step = frames // 2 % len(trajectory.actions)
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             for camera in CAMERAS:
-                encode(to_policy(renderer.frame(camera)), RenderConfig())
+                encode(to_policy(renderer.frame(camera)), RenderConfig().jpeg_quality)
                 frames += 1
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return Rendered(frames, spent, time.process_time() - start_cpu, peak_gb, plain)

@@ -1,4 +1,4 @@
-"""Program ``python -m pipeline``, installed also as ``perturbed-demos``."""
+"""Program ``python -m pipeline``, installed also as ``perturbed-libero``."""
 
 import sys
 

@@ -17,13 +17,13 @@ from pipeline.catalogue import object_sources, texture_sources
 from pipeline.compute_config import ComputeConfig
 from pipeline.config_faults import describe
 from pipeline.errors import PipelineError
-from pipeline.export_config import CLEAN, LONGEST_NAME, Count, ExportConfig, known_to_oft
+from pipeline.export_config import CLEAN, ExportConfig
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish_config import PublishConfig
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
-from pipeline.types import Place, RenderedExtra
+from pipeline.types import LONGEST_NAME, Count, Place, RenderedExtra
 
 CHECKOUT = (
     *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),
@@ -252,11 +252,8 @@ class Config(Frozen):
     @classmethod
     def _named(cls, export: ExportConfig, info: ValidationInfo) -> ExportConfig:
         named = export.named(f"libero_{info.data.get('name', '')}")
-        if named.rlds and not known_to_oft(named.rlds.name):
-            raise ValueError(
-                f"export.rlds.name {named.rlds.name!r} would be read with another robot's constants and cameras by "
-                "OpenVLA-OFT, which goes by the name; expected a name with libero and without aloha in it"
-            )
+        for options in named.formats.values():
+            options.refuse_name()
         return named
 
     @model_validator(mode="after")

@@ -9,10 +9,10 @@ import pytest
 from command_words import parse
 from conftest import REPOSITORY
 
-PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md")])
+PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("benchmarks/*.md")])
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
-COMMAND = re.compile(r"(?:\S*python -m pipeline|perturbed-demos) (.*)")
+COMMAND = re.compile(r"(?:\S*python -m pipeline|perturbed-libero) (.*)")
 
 
 def anchors(page: Path) -> set[str]:

@@ -75,11 +75,11 @@ def test_the_wheel_holds_every_file_of_the_library_and_nothing_else(installed: P
 
     expected = files(REPOSITORY / "pipeline") | {f"schemas/{name}" for name in files(REPOSITORY / "schemas")}
     assert files(installed / "pipeline") == expected
-    assert sorted(path.name.partition("-")[0] for path in installed.iterdir()) == ["perturbed_demos", "pipeline"]
+    assert sorted(path.name.partition("-")[0] for path in installed.iterdir()) == ["perturbed_libero", "pipeline"]
 
 
 def test_the_wheel_brings_a_command_of_its_own_name(installed: Path) -> None:
     (information,) = installed.glob("*.dist-info")
     (command,) = Distribution.at(information).entry_points.select(group="console_scripts")
-    assert command.name == "perturbed-demos"
+    assert command.name == "perturbed-libero"
     assert command.load() is main

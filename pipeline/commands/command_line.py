@@ -70,10 +70,10 @@ def run() -> int:
     Returns:
         Exit status.
     """
-    installed = Path(sys.argv[0]).name == "perturbed-demos"
+    installed = Path(sys.argv[0]).name == "perturbed-libero"
     try:
         status: int = top.main(
-            prog_name="perturbed-demos" if installed else "python -m pipeline", standalone_mode=False
+            prog_name="perturbed-libero" if installed else "python -m pipeline", standalone_mode=False
         )
     except click.ClickException as error:
         error.show()

@@ -46,7 +46,7 @@ def check(config: Path) -> int:
         damaged += findings["damaged"]
     trained: dict[str, Any] = {}
     # OpenVLA-OFT's reader stops at damaged files.
-    if run.config.export.rlds and not stored["rlds"]["damaged"]:
+    if "rlds" in run.config.export.formats and not stored["rlds"]["damaged"]:
         trained = oft.check_all(run.dataset("rlds").folder, run.path(STATISTICS))
     misleading: list[str] = []
     for name, findings in trained.items():

@@ -57,6 +57,23 @@ def tasks(patterns: tuple[str, ...]) -> None:
         print(f"{task}\t{task.instruction}")
 
 
+class AxisNames(OneOf):
+    """Name of an axis, names of several joined by +, or ``all``."""
+
+    def __init__(self) -> None:
+        super().__init__(_axes)
+
+    def convert(self, value: str, parameter: click.Parameter | None, context: click.Context | None) -> str:
+        from pipeline.axes import axes_of
+
+        if value == EVERY:
+            return value
+        try:
+            return "+".join(axes_of(value))
+        except ValueError as error:
+            self.fail(f"{error}; or {EVERY}.", parameter, context)
+
+
 def _axes() -> Iterable[str]:
     from pipeline.axes import AXES
 
@@ -65,7 +82,12 @@ def _axes() -> Iterable[str]:
 
 @click.command(cls=Command)
 @click.argument("task", metavar="TASK", help="Pattern of <suite>/<task>, such as 'libero_goal/turn_on*'.")
-@click.argument("axis", metavar="AXIS", type=OneOf(_axes), help=f"An axis, or `{EVERY}` for one picture of each axis.")
+@click.argument(
+    "axis",
+    metavar="AXIS",
+    type=AxisNames(),
+    help=f"An axis, several joined by +, or `{EVERY}` for one picture of each axis.",
+)
 @click.argument(
     "config",
     metavar="[CONFIG]",
@@ -80,9 +102,11 @@ def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
     """Render perturbations of a task into one picture.
 
     The picture shows the first frame of the task, and up to eleven perturbations over the components and levels of an
-    axis. With `all`, it shows a strong perturbation on each axis next to the clean twin. An axis that the configuration
-    does not name has default ranges. If FILE ends in .jpg, it is a JPEG, else a PNG. Only a picture of an earlier
-    preview is overwritten.
+    axis. Several axes joined by +, such as camera+noise, change each picture together. With `all`, the picture shows a
+    perturbation of a middle level on each axis next to the clean twin.
+
+    An axis that the configuration does not name has default ranges. If FILE ends in .jpg, it is a JPEG, else a PNG.
+    Only a picture of an earlier preview is overwritten.
     """
     from PIL.PngImagePlugin import PngInfo
 

@@ -63,7 +63,7 @@ def status(config: Path) -> None:
     """
     from rich.console import Console
 
-    from pipeline.validation import status
+    from pipeline import status
 
     console = Console(soft_wrap=True, highlight=False)
     for part in status.told(open_run(config)):

@@ -34,8 +34,10 @@ INITIAL_STATES = 50
 COLUMNS = {"suites": "suite", "axes": "axis", "components": "component", "levels": "level"}
 """Field of a selection to the field of a task that it restricts."""
 
-PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
-"""Axes of the six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
+PAIR_AXES = tuple(name for name in OWN_AXES if AXES[name].dimension == name)
+"""Axes of the six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise.
+
+Each has the name of its dimension; pose is a second axis of the dimension layout."""
 
 CANDIDATES = 500
 """Number of candidates of each axis in each suite, spread evenly over tasks and levels."""

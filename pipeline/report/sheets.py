@@ -11,13 +11,17 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
-from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.run.counts import by_axis, twins
 from pipeline.types import Episode, Frame
 
+Font = ImageFont.ImageFont | ImageFont.FreeTypeFont
+
 LINE_PX = 16
+LETTER_PX = 22
+"""Height of the letters of a rewritten instruction that stands in place of a picture."""
+
 GAP_PX = 8
 COLUMNS = 4
 UNSHOWN = {"sha256", "licence", "attribution", "category"}
@@ -92,9 +96,9 @@ def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
 
 def _moment(perturbations: Sequence[Perturbation], steps: int) -> int:
     """Return the step at which an episode of ``steps`` steps is shown."""
-    for push in perturbations:
-        if isinstance(push, DisturbancePerturbation):
-            return min(push.first_step + push.steps, steps - 1)
+    for change in perturbations:
+        if change.acts_until is not None:
+            return min(change.acts_until, steps - 1)
     # The arm is back on the demonstration's path soon after another start.
     return 0 if any(change.layer is Layer.PHYSICS for change in perturbations) else int(MOMENT * steps)
 
@@ -178,20 +182,32 @@ def sheet(title: str, tiles: Sequence[Tile], columns: int = COLUMNS) -> Image.Im
     return page
 
 
+def lettering(text: str, side_px: int) -> Image.Image:
+    """Return a square picture of a text in large letters."""
+    page = Image.new("RGB", (side_px, side_px), "whitesmoke")
+    font = ImageFont.load_default(LETTER_PX)
+    lines = _wrapped(f"“{text}”", side_px - 4 * GAP_PX, font)
+    ImageDraw.Draw(page).multiline_text(
+        (side_px / 2, side_px / 2), "\n".join(lines), fill="black", font=font, anchor="mm", align="center"
+    )
+    return page
+
+
 def _write(page: Image.Image, lines: Sequence[str], left: int, top: int) -> None:
     pen = ImageDraw.Draw(page)
     for number, line in enumerate(lines):
         pen.text((left, top + number * LINE_PX), line, fill="black", font=_font())
 
 
-def _wrapped(text: str, width_px: int) -> list[str]:
+def _wrapped(text: str, width_px: int, font: Font | None = None) -> list[str]:
     """Break ``text`` into lines of at most ``width_px``; only a single word may be wider."""
     lines: list[str] = []
+    font = font or _font()
     for word in text.split(" "):
         # The font has no glyph for the no-break space.
         word = word.replace(NO_BREAK, " ")
         longer = f"{lines[-1]} {word}" if lines else word
-        if lines and _font().getlength(longer) <= width_px:
+        if lines and font.getlength(longer) <= width_px:
             lines[-1] = longer
         else:
             lines.append(word)
@@ -199,5 +215,5 @@ def _wrapped(text: str, width_px: int) -> list[str]:
 
 
 @cache
-def _font() -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
+def _font() -> Font:
     return ImageFont.load_default(12)

@@ -85,7 +85,7 @@ def _kept(counts: Counts) -> Cell:
 
 def _by_axis(title: str, rows: Rows, column: str) -> Table:
     counts = tally(rows, column)
-    values = sorted({value for of_axis in counts.values() for value in of_axis})
+    values = sorted(set().union(*counts.values()))
     body: list[tuple[Cell, ...]] = []
     for axis, of_axis in counts.items():
         numbers = [Cell(f"{of_axis[value]:,}" if of_axis[value] else "-") for value in values]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 import yaml
 from command_words import commands, parse
@@ -72,15 +73,15 @@ def test_a_moved_command_names_its_new_place(
 @pytest.mark.parametrize(
     ("words", "position", "offered"),
     [
-        ("perturbed-demos sta", 1, {"status"}),
-        ("perturbed-demos dataset ", 2, {"check", "audit", "regenerate", "push"}),
-        ("perturbed-demos preview TASK c", 3, {"camera"}),
-        ("perturbed-demos clean --only t", 3, {"trajectories", "tables"}),
+        ("perturbed-libero sta", 1, {"status"}),
+        ("perturbed-libero dataset ", 2, {"check", "audit", "regenerate", "push"}),
+        ("perturbed-libero preview TASK c", 3, {"camera"}),
+        ("perturbed-libero clean --only t", 3, {"trajectories", "tables"}),
     ],
 )
 def test_a_shell_completes_commands_and_names(words: str, position: int, offered: set[str]) -> None:
-    asked = {"_PERTURBED_DEMOS_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": str(position)}
-    command = [str(SCRIPTS / "perturbed-demos")]
+    asked = {"_PERTURBED_LIBERO_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": str(position)}
+    command = [str(SCRIPTS / "perturbed-libero")]
     done = subprocess.run(command, env={**IN_SCRIPTS, **asked}, capture_output=True, text=True, check=False)
     assert {line.partition(",")[2] for line in done.stdout.splitlines()} == offered
 
@@ -91,6 +92,7 @@ def test_a_shell_completes_commands_and_names(words: str, position: int, offered
         ["dataset", "regenerate", "ID", "--out", "again", "mine.yaml"],
         ["dataset", "push", "rlds", "me/x", "--really", "mine.yaml"],
         ["preview", "libero_goal/*", "camera", "--out", "a.png", "mine.yaml"],
+        ["preview", "libero_goal/*", "noise+camera", "--out", "a.png", "mine.yaml"],
         ["preview", "--out", "a.png", "libero_goal/*", "camera", "mine.yaml"],
         ["clean", "--only", "rlds", "mine.yaml", "--yes"],
     ],
@@ -98,6 +100,14 @@ def test_a_shell_completes_commands_and_names(words: str, position: int, offered
 )
 def test_the_configuration_is_the_last_argument_whatever_stands_before_it(words: list[str]) -> None:
     assert parse(words).params["config"] == Path("mine.yaml")
+
+
+def test_a_preview_names_axes_in_any_order() -> None:
+    words = ["preview", "libero_goal/*", "--out", "a.png"]
+    assert parse([*words, "noise+camera"]).params["axis"] == "camera+noise"
+    assert parse([*words, "all"]).params["axis"] == "all"
+    with pytest.raises(click.UsageError, match=r"'noise\+cameras' names no axis with 'cameras', expected layout, "):
+        parse([*words, "noise+cameras"])
 
 
 def test_lists(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,7 +154,7 @@ def configured(clone: Path, **sections: Any) -> None:
     file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
 
 
-def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
+def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path, short_demos: Path) -> None:
     def would_run() -> list[str]:
         done = call(clone, "status", "configs/tiny.yaml")
         assert done.returncode == 0, done.stderr
@@ -168,14 +178,19 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     assert would_run() == ["card"]
     assert "render 0 s, export 0 s, validate 0 s" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / "card").rename(clone / "data/tiny/card")
-    listed = clone / "data/tiny/inputs.json"
-    before_edit = listed.read_text()
-    listed.write_text(json.dumps(json.loads(before_edit) | {"demos.root/another": [1, 2]}))
+    (clone / "data/tiny/leakage.json").write_text("{}")
+    assert would_run() == ["leakage", "card", "report"]
+    assert "leakage: leakage.json is missing or has changed" in call(clone, "status", "configs/tiny.yaml").stdout
+    shutil.copy(finished / "leakage.json", clone / "data/tiny/leakage.json")
+    demos = tiny_config(shutil.copytree(short_demos, clone / short_demos.name))["demos"]
+    configured(clone, demos=demos)
+    assert would_run() == [], "the place of the demonstrations changes nothing"
+    (clone / short_demos.name / "another").write_text("")
     assert would_run() == ["plan", "exports and all that follows"]
-    assert "files that it names (1, such as demos.root/another)" in call(clone, "status", "configs/tiny.yaml").stdout
-    listed.write_text(before_edit)
+    assert "plan: other demos.root/another" in call(clone, "status", "configs/tiny.yaml").stdout
+    (clone / short_demos.name / "another").unlink()
     configured(clone, export={"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 2}})
-    assert would_run() == ["export_rlds", "manifest and all that follows"]
+    assert would_run() == ["doctor", "export_rlds", "manifest and all that follows"]
     configured(clone, export=tiny_config(clone)["export"])
     rendered, *others = sorted((clone / "data/tiny/frames").glob("*/"))
     shutil.rmtree(rendered)
@@ -183,7 +198,7 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     (clone / "data/tiny/trajectories" / f"{others[0].name}.npz").unlink()
     assert would_run() == ["replay", "render", "exports and all that follows"]
     configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
-    assert "plan: another configuration: plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "plan: other plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / "data/tiny/plan.parquet").unlink()
     told = call(clone, "status", "configs/tiny.yaml").stdout
     assert "  plan: " in told

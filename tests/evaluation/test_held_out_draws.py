@@ -49,7 +49,7 @@ def test_a_planted_copy_of_a_held_out_draw_is_found(axis: str) -> None:
 
 def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
     axis = NoiseAxis()
-    effects = [effect for name in ("motion", "gaussian", "zoom", "fog", "glass") for effect in getattr(axis, name)]
+    effects = [effect for name in ("motion", "gaussian_blur", "zoom", "fog", "glass") for effect in getattr(axis, name)]
     trained = [NoisePerturbation(component=effect.component, effect=effect, level=1, seed=0) for effect in effects]
     tasks = select(Selection(source="own", axes=("noise",), episodes=2))
     planned = PlannedDraws([planned_row(tasks[0], one) for one in trained])
