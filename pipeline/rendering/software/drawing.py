@@ -24,7 +24,6 @@ from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay
 from pipeline.rendering.software.samples import SAMPLES
 from pipeline.rendering.software.skins import SkinnedMeshes
-from pipeline.types import Frame
 
 LOOK = tuple(name for name in FIELDS if name != "tex_data")
 """Arrays of a model, without textures, that perturbations may change and on which a picture depends."""
@@ -148,15 +147,13 @@ class SoftwareDrawing(PlainDrawing):
         for underlay in self._underlays.values():
             underlay.content = b""
 
-    def frame(self, data: mujoco.MjData, camera: str) -> Frame:
-        """Render a frame like ``PlainDrawing.frame``, with savings."""
-        self._gl.make_current()
+    def _draw(self, data: mujoco.MjData, camera: str) -> None:
+        """Render a picture like ``PlainDrawing``, with savings."""
         shot = Shot(data, camera, self._culling.picture(data, camera))
         if shot.picture.underlaid:
             self._draw_over_still(shot)
         else:
-            self._draw(shot, shot.picture.opaque)
-        return self._pixels()
+            self._draw_geoms(shot, shot.picture.opaque)
 
     def _draw_over_still(self, shot: Shot) -> None:
         """Render a picture over an underlay of the geoms that stand still."""
@@ -172,11 +169,13 @@ class SoftwareDrawing(PlainDrawing):
                 self._underlays[camera] = Underlay(self._context, self._rectangle.height, self._rectangle.width)
             underlay, content = self._underlays[camera], view + still.tobytes() + places[still].tobytes()
             if underlay.content != content:
-                self._draw(shot, still, last=False)
+                self._draw_geoms(shot, still, last=False)
                 underlay.keep(content)
-        self._draw(shot, opaque & ~still, underlay)
+        self._draw_geoms(shot, opaque & ~still, underlay)
 
-    def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
+    def _draw_geoms(
+        self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True
+    ) -> None:
         """Render opaque geoms of a picture over an underlay.
 
         Args:

@@ -1,0 +1,140 @@
+"""Rendering of the pixels of ``PlainDrawing`` on a GPU, with less work for the GPU and less waiting for it.
+
+* Geoms outside of the view are not rendered (``culling.py``), and mirror images only if they show.
+* The GPU copies finished frames into pixel buffers, which a process reads later. Meanwhile it prepares further frames.
+
+The other savings choose single faces or geoms for each picture. This takes more CPU time than a GPU saves.
+"""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.opengl import calls, check
+from pipeline.rendering.software.culling import Culling
+from pipeline.types import Frame
+
+IN_FLIGHT = 8
+"""Number of frames that a GPU may work on while the process does something else: four steps of two views."""
+
+CULLED = mujoco.mjNGROUP - 1
+"""A group of geoms and sites that LIBERO does not use and that is never rendered."""
+
+
+class PixelBuffers:
+    """Ring of pixel buffers of the current context, into which OpenGL copies frames while the process goes on.
+
+    The copy takes the same steps as ``mjr_readPixels``: it averages the samples of each pixel, then it reads the
+    averages.
+
+    Args:
+        context: MuJoCo's context.
+        count: number of buffers.
+    """
+
+    def __init__(self, context: mujoco.MjrContext, count: int):
+        self._context, (self._height, self._width, _) = context, SCHEMA.frame.shape
+        opengl = calls()
+        self._buffers: list[int] = np.atleast_1d(opengl.glGenBuffers(count)).tolist()
+        for buffer in self._buffers:
+            opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, buffer)
+            size = 4 * self._height * self._width
+            opengl.glBufferData(opengl.GL_PIXEL_PACK_BUFFER, size, None, opengl.GL_STREAM_READ)
+        opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, 0)
+        self._waiting: dict[int, Frame | None] = {}
+        self._started = 0
+
+    def start_copy(self) -> int:
+        """Start to copy the off-screen buffer, and return the copy's number for :meth:`take`.
+
+        If all buffers are in use, wait for the oldest copy first.
+        """
+        number = self._started
+        self._started += 1
+        oldest = number - len(self._buffers)
+        if oldest in self._waiting and self._waiting[oldest] is None:
+            self._waiting[oldest] = self._read(oldest)
+        opengl, context = calls(), self._context
+        corners = 0, 0, self._width, self._height
+        source = context.offFBO
+        if context.offSamples:
+            source = context.offFBO_r
+            opengl.glBindFramebuffer(opengl.GL_READ_FRAMEBUFFER, context.offFBO)
+            opengl.glBindFramebuffer(opengl.GL_DRAW_FRAMEBUFFER, context.offFBO_r)
+            opengl.glBlitFramebuffer(*corners, *corners, opengl.GL_COLOR_BUFFER_BIT, opengl.GL_NEAREST)
+        opengl.glBindFramebuffer(opengl.GL_READ_FRAMEBUFFER, source)
+        opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, self._buffers[number % len(self._buffers)])
+        # A whole number in place of an array is a place in the buffer. Four bytes a pixel need no conversion.
+        opengl.glReadPixels(*corners, opengl.GL_RGBA, opengl.GL_UNSIGNED_BYTE, 0)
+        opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, 0)
+        mujoco.mjr_restoreBuffer(context)
+        check("mjr_restoreBuffer")
+        opengl.glFlush()
+        self._waiting[number] = None
+        return number
+
+    def take(self, number: int) -> Frame:
+        """Wait for a copy, and return its frame (H, W, 3) of uint8 RGB; each copy can be taken once."""
+        frame = self._waiting.pop(number)
+        return self._read(number) if frame is None else frame
+
+    def _read(self, number: int) -> Frame:
+        opengl = calls()
+        pixels = np.empty((self._height, self._width, 4), np.uint8)
+        opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, self._buffers[number % len(self._buffers)])
+        opengl.glGetBufferSubData(opengl.GL_PIXEL_PACK_BUFFER, 0, pixels.nbytes, pixels)
+        opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, 0)
+        return np.ascontiguousarray(pixels[..., :3])
+
+
+class GpuDrawing(PlainDrawing):
+    """Drawing of any model on a GPU, by public functions of MuJoCo and OpenGL.
+
+    Raises:
+        PipelineError: if this machine cannot render, or OpenGL reports an error.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        super().__init__(model)
+        self._culling = Culling(model, np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist())
+        self._buffers: PixelBuffers | None = None
+
+    @staticmethod
+    def possible(model: mujoco.MjModel) -> bool:
+        """Return whether this drawing can render a model: all its planes need bounds, which LIBERO's planes have."""
+        return bool((model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] > 0).all())
+
+    def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
+        """Start to render a frame; see ``PlainDrawing``. Up to ``IN_FLIGHT`` frames are rendered at a time."""
+        self._gl.make_current()
+        if self._buffers is None:
+            self._buffers = PixelBuffers(self._context, IN_FLIGHT)
+        self._draw(data, camera)
+        buffers, number = self._buffers, self._buffers.start_copy()
+
+        def wait() -> Frame:
+            self._gl.make_current()
+            return buffers.take(number)
+
+        return wait
+
+    def _draw(self, data: mujoco.MjData, camera: str) -> None:
+        """Render a picture without the geoms and sites that it cannot show."""
+        model, flags, picture = self._model, self._scene.flags, self._culling.picture(data, camera)
+        rendered = picture.opaque | picture.clear | picture.mirror
+        mirrors = bool(picture.mirror.any())
+        if mirrors:
+            rendered = rendered | picture.images
+        groups, site_groups = model.geom_group.copy(), model.site_group.copy()
+        try:
+            model.geom_group[:] = np.where(rendered, groups, CULLED)
+            model.site_group[:] = np.where(picture.sites, site_groups, CULLED)
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = mirrors
+            super()._draw(data, camera)
+        finally:
+            model.geom_group[:] = groups
+            model.site_group[:] = site_groups
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 1
