@@ -408,7 +408,7 @@ def profile(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float)
         for name, function in functions.items():
             setattr(mujoco, name, function)
     opengl = calls()
-    gpu_ns = [int(np.ravel(opengl.glGetQueryObjectui64v(query, opengl.GL_QUERY_RESULT))[0]) for query in queries]
+    gpu_ns = [int(np.ravel(opengl.glGetQueryObjectuiv(query, opengl.GL_QUERY_RESULT))[0]) for query in queries]
     opengl.glDeleteQueries(len(queries), queries)
     work.parts_s |= spent_s | {"GPU": sum(gpu_ns) / 1e9, "all": work.seconds}
     return work
