@@ -1,15 +1,19 @@
-"""Choice between plain rendering and savings, which are optimizations of software rendering with equal pixels.
+"""Choice between plain rendering and savings, which are optimizations of rendering with equal pixels.
 
-Savings are used with the MuJoCo version and the device with which they were tested. Each process first renders a small
-scene both ways (0.6 s) and uses savings only if all pixels are equal. Otherwise, and on request, scenes are rendered
-plainly. Without a GPU, plain rendering takes several times as long.
+Savings of software rendering are used with the MuJoCo version and the device with which they were tested. On a GPU,
+other savings are used. Each process first renders a small scene both ways (0.6 s in software) and uses savings only if
+all pixels are equal. Otherwise, and on request, scenes are rendered plainly. Without a GPU, plain rendering takes
+several times as long.
 """
+
+from __future__ import annotations
 
 import functools
 import importlib.util
 import logging
 import os
 from contextlib import closing
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -18,6 +22,10 @@ from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.types import Frame
+
+if TYPE_CHECKING:
+    from pipeline.rendering.software.drawing import SoftwareDrawing
+    from pipeline.rendering.software.gpu import GpuDrawing
 
 PLAIN = "PLAIN_RENDERING"
 """Environment variable: if it is set and not empty, all scenes are rendered plainly."""
@@ -67,12 +75,29 @@ SCENE = f"""
 def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
     """Create a drawing of a model, with savings if they can be used."""
     if why_plain() is None:
-        from pipeline.rendering.software.drawing import SoftwareDrawing
-
-        if SoftwareDrawing.possible(model):
-            return SoftwareDrawing(model)
+        kind = kind_with_savings(gl.choose().software)
+        if kind.possible(model):
+            return kind(model)
         _say("a scene has height fields, skins, a floor without bounds, or not four samples a pixel")
     return PlainDrawing(model)
+
+
+def kind_with_savings(software: bool) -> type[SoftwareDrawing] | type[GpuDrawing]:
+    """Return the kind of drawing that renders with savings on a device.
+
+    In software, rendering a face takes longer than the choice of faces, so all savings are used. A GPU renders a face
+    in less time than a CPU chooses it, so its drawing leaves out whole geoms only.
+
+    Args:
+        software: True for a device without a GPU.
+    """
+    if software:
+        from pipeline.rendering.software.drawing import SoftwareDrawing
+
+        return SoftwareDrawing
+    from pipeline.rendering.software.gpu import GpuDrawing
+
+    return GpuDrawing
 
 
 @functools.cache
@@ -83,17 +108,15 @@ def why_plain() -> str | None:
     """
     if os.environ.get(PLAIN):
         return f"{PLAIN} is set"
-    device = gl.choose().device
-    if not gl.choose().software:
-        return f"{device} is quick without savings"
+    device, software = gl.choose().device, gl.choose().software
     if mujoco.__version__ != MUJOCO:
         reason = f"savings were tested with MuJoCo {MUJOCO}, this is {mujoco.__version__}"
-    elif not device.startswith(DEVICE):
+    elif software and not device.startswith(DEVICE):
         reason = f"savings were tested with {DEVICE}, this is {device}"
     elif importlib.util.find_spec("pipeline.rendering.software") is None:
         reason = "this installation has no savings"
     else:
-        difference = fault()
+        difference = fault(kind_with_savings(software))
         if difference is None:
             return None
         reason = f"on {device} {difference}"
@@ -104,15 +127,13 @@ def why_plain() -> str | None:
 @functools.cache
 def _say(reason: str) -> None:
     """Log that scenes are rendered plainly, once a process for each reason."""
-    logging.getLogger(__name__).warning("software-rendering optimizations are disabled: %s", reason)
+    logging.getLogger(__name__).warning("rendering optimizations are disabled: %s", reason)
 
 
-def fault() -> str | None:
-    """Return the error or the difference that savings cause here; ``None`` if all pixels are equal."""
-    from pipeline.rendering.software.drawing import SoftwareDrawing
-
+def fault(kind: type[PlainDrawing]) -> str | None:
+    """Return the error or the difference that a kind of drawing causes here; ``None`` if all pixels are equal."""
     try:
-        plain, saving = frames(PlainDrawing), frames(SoftwareDrawing)
+        plain, saving = frames(PlainDrawing), frames(kind)
     except PipelineError as error:
         return f"OpenGL rejects a command of the savings: {error.what}"
     frame_pairs = zip(plain, saving, strict=True)
