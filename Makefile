@@ -15,7 +15,7 @@ test:
 	bash setup.sh test
 
 doctor: setup
-	.venv/bin/python -m pipeline doctor
+	.venv/bin/python -m pipeline doctor configs/starter.yaml
 
 # pynput and evdev are left out: only lerobot's keyboard teleoperation needs them, and evdev takes a compiler.
 lock: setup

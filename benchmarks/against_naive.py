@@ -26,7 +26,7 @@ from pipeline.config import Config, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.libero.tasks import find_task, select_tasks
-from pipeline.machine_code import SETTINGS, ensure_fixed_machine_code
+from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_code
 from pipeline.physics.environment import DUMMY_ACTION
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
@@ -133,12 +133,13 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
             for noise in of_layer(perturbations, PixelPerturbation):
                 if view in noise.views:
                     frame = noise.apply(frame, step)
-            frames[view].append(encode(to_policy(frame), config.render))
+            frames[view].append(encode(to_policy(frame), config.render.jpeg_quality))
         env.step(action)
     env.close()
     return frames
 
 
 if __name__ == "__main__":
-    ensure_fixed_machine_code(SETTINGS | {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
+    one_thread = {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    ensure_fixed_machine_code(MACHINE_CODE_VARIABLES | one_thread)
     main()

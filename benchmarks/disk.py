@@ -16,7 +16,7 @@ from pipeline.config import load
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.validation.needs import needed_mb
 
-STAGES = ("inputs", "plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest", "validate")
+STAGES = ("inputs", "plan", "leakage", "replay", "render", "exports", "manifest", "validate")
 EVERY_S = 0.3
 
 

@@ -109,7 +109,12 @@ def ours(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Path,
     suites = list(dict.fromkeys(suite for suite, _ in tasks))
     names = list(dict.fromkeys(name for _, name in tasks))
     program = [sys.executable, "-m", "pipeline", "evaluate", str(out), "--server", address, *options]
-    return [*program, "--label", out.name, "--suite", *suites, "--task", *names, "--episodes", str(states)]
+    program += ["--label", out.name, "--episodes", str(states)]
+    for suite in suites:
+        program += ["--suite", suite]
+    for name in names:
+        program += ["--task", name]
+    return program
 
 
 def timed(commands: Sequence[Sequence[str]], episodes: int) -> dict[str, Any]:

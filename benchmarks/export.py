@@ -19,14 +19,13 @@ import numpy as np
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.run.export import export
-from pipeline.types import Episode, Geometry
+from pipeline.types import Episode, Geometry, Jpeg
 
 PER_PART = 150
 """Episodes in a part of the large configurations."""
@@ -41,9 +40,10 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
     noise = rng.integers(0, 256, (height + 64, width + 64, 3), np.uint8)
     texture = cv2.addWeighted(cv2.GaussianBlur(noise, (0, 0), 16), 8, cv2.GaussianBlur(noise, (0, 0), 1.5), 0.6, -980)
 
-    def frame(t: int) -> bytes:
+    def frame(t: int) -> Jpeg:
         dy, dx = (32 + 30 * np.array([np.sin(t / 40), np.cos(t / 40)])).astype(int)
-        return cv2.imencode(".jpg", texture[dy:, dx:][:height, :width], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        shown = texture[dy:, dx:][:height, :width]
+        return Jpeg(cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
 
     frames = [frame(t) for t in range(steps)]
     defaults = dict[str, Any](string="", int64=0, float32=0.0)

@@ -28,7 +28,7 @@ from replayed_twin import replayed_twin
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode, to_policy
-from pipeline.machine_code import SETTINGS, ensure_fixed_machine_code
+from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_code
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame, Trajectory
@@ -92,7 +92,7 @@ def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool, dr
                 start, drawn_before_s = time.process_time(), drawn.spent_s
                 renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                 pictures.append(renderer.frame(camera))
-                encode(to_policy(pictures[-1]), RenderConfig())
+                encode(to_policy(pictures[-1]), RenderConfig().jpeg_quality)
                 took_s = time.process_time() - start
                 spent_s[name] += took_s
                 beside_s[name] += took_s - (drawn.spent_s - drawn_before_s)
@@ -107,5 +107,5 @@ def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool, dr
 
 
 if __name__ == "__main__":
-    ensure_fixed_machine_code(SETTINGS | {"LP_NUM_THREADS": "1"})
+    ensure_fixed_machine_code(MACHINE_CODE_VARIABLES | {"LP_NUM_THREADS": "1"})
     main()

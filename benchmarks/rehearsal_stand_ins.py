@@ -25,7 +25,7 @@ from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode
 from pipeline.planning.streams import Stream
-from pipeline.types import Demo, Frame, Geometry, Rendered, Scene, Task, Trajectory, Verdict
+from pipeline.types import Demo, Frame, Geometry, Jpeg, Rendered, Scene, Task, Trajectory, Verdict
 from pipeline.validation.checks import ARM
 
 STEPS = 8
@@ -66,10 +66,10 @@ def render(
 ) -> Rendered:
     """Return frames with a different pattern for each stream and step."""
     steps = len(trajectory.actions)
-    streams_of_frames: dict[str, list[bytes]] = {}
+    streams_of_frames: dict[str, list[Jpeg]] = {}
     for stream in streams:
         patterns = [_pattern(f"{stream.stream_id} {step}") for step in range(steps)]
-        streams_of_frames[stream.stream_id] = [encode(pattern, config) for pattern in patterns]
+        streams_of_frames[stream.stream_id] = [encode(pattern, config.jpeg_quality) for pattern in patterns]
     geometries = {stream.geometry for stream in streams}
     fixed = Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
     state = np.zeros((steps, 8), np.float32)

@@ -29,7 +29,7 @@ from episode_slice import sliced
 from pipeline.compute.pool import Workers, loop, runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
-from pipeline.machine_code import SETTINGS, ensure_fixed_machine_code
+from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.render_stage import render_plan
@@ -103,5 +103,5 @@ def _warm(number: int) -> None:
 
 
 if __name__ == "__main__":
-    ensure_fixed_machine_code(SETTINGS | {"LP_NUM_THREADS": "1"})
+    ensure_fixed_machine_code(MACHINE_CODE_VARIABLES | {"LP_NUM_THREADS": "1"})
     main()

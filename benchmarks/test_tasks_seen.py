@@ -1,4 +1,4 @@
-"""Measures of the observations in LIBERO's and LIBERO-Plus's evaluations, for `python -m pipeline analyse coverage`.
+"""Measures of the observations in LIBERO's and LIBERO-Plus's evaluations, for `python -m pipeline analyze coverage`.
 
     nice -n 10 python benchmarks/test_tasks_seen.py > pipeline/testset/seen.json
 
@@ -16,6 +16,7 @@ from contextlib import closing
 import numpy as np
 
 from pipeline.axes import level_of_test
+from pipeline.axes.robot import measure_start
 from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.simulator import Simulator
@@ -24,7 +25,8 @@ from pipeline.libero import bddl
 from pipeline.libero.tasks import tasks
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.rendering.renderer import Renderer
-from pipeline.report.seen import Look, spread
+from pipeline.report.seen import clean_measures, spread
+from pipeline.scenes.look import Look
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
 from pipeline.types import Task
@@ -43,7 +45,7 @@ def main() -> None:
         with closing(Simulator(task)) as simulator:
             simulator.start(0, libero_states(task)[0])
             look = looks[task.suite, task.name] = Look.of(simulator.model, simulator.state)
-            measured = list(look.measures().items())
+            measured = list(clean_measures(look).items())
             arena = bddl.read(task.bddl_file).arena
             if arena not in measured_arenas:
                 measured_arenas.add(arena)
@@ -51,8 +53,8 @@ def main() -> None:
             for number, test in _robot_starts(task):
                 simulator.start(0, libero_states(task)[0], libero_plus.postures_rad()[number])
                 moved = Look.of(simulator.model, simulator.state)
-                level = level_of_test(test)
-                measured += moved.away_from(look, "controller_posture", level).items()
+                for what, value in measure_start(moved, look, "controller_posture", level_of_test(test)):
+                    measured.append((f"robot: {what}", value))
         for name, value in measured:
             values[name].append(value)
         print(task.name, file=sys.stderr)

@@ -29,7 +29,7 @@ from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.lerobot_video import Video
+from pipeline.formats.lerobot.write import Video
 from pipeline.images.jpeg import decode, encode, to_policy
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.machine_code import ensure_fixed_machine_code
@@ -90,7 +90,7 @@ def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Fra
     renderer.close()
     for view, frames in raw.items():
         yield f"{entry.task.suite} {view}", [to_policy(frame) for frame in frames]
-    for component in ("motion", "gaussian", "zoom", "fog", "glass"):
+    for component in ("motion", "gaussian_blur", "zoom", "fog", "glass"):
         effect = getattr(NoiseAxis(), component)[STRONGEST - 1]
         noisy: list[Frame] = []
         for step, frame in enumerate(raw["image"]):
@@ -100,7 +100,7 @@ def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Fra
 
 def _measure(frames: Sequence[Frame]) -> NDArray[np.float64]:
     """Measure the decibels of ``COLUMNS`` and the bytes in video and store, for each frame: (T, 5)."""
-    stored = [encode(frame, RenderConfig()) for frame in frames]
+    stored = [encode(frame, RenderConfig().jpeg_quality) for frame in frames]
     pixels = [decode(packed) for packed in stored]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "shown.mp4"

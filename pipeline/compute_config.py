@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from pipeline.axes.base import Frozen
-from pipeline.export_config import Count
+from pipeline.types import Count
 
 LARGEST_GB = 4.6
 """Most memory that a worker process has taken: in ``validate`` of 1,004 episodes of all 40 tasks (docs/cost.md)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,14 +15,15 @@ from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank
 from pipeline.catalogue import object_sources, texture_sources
 from pipeline.compute_config import ComputeConfig
+from pipeline.config_faults import describe
 from pipeline.errors import PipelineError
-from pipeline.export_config import CLEAN, LONGEST_NAME, Count, ExportConfig, known_to_oft
+from pipeline.export_config import CLEAN, ExportConfig
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish_config import PublishConfig
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
-from pipeline.types import Place, RenderedExtra
+from pipeline.types import LONGEST_NAME, Count, Place, RenderedExtra
 
 CHECKOUT = (
     *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),
@@ -252,11 +252,8 @@ class Config(Frozen):
     @classmethod
     def _named(cls, export: ExportConfig, info: ValidationInfo) -> ExportConfig:
         named = export.named(f"libero_{info.data.get('name', '')}")
-        if named.rlds and not known_to_oft(named.rlds.name):
-            raise ValueError(
-                f"export.rlds.name {named.rlds.name!r} would be read with another robot's constants and cameras by "
-                "OpenVLA-OFT, which goes by the name; expected a name with libero and without aloha in it"
-            )
+        for options in named.formats.values():
+            options.refuse_name()
         return named
 
     @model_validator(mode="after")
@@ -339,12 +336,9 @@ def load(path: Path) -> Config:
     except (yaml.YAMLError, RecursionError) as error:
         raise PipelineError(f"not valid YAML: {error}", where=path, expected="a file like those of configs/") from error
     except ValidationError as error:
-        faults = []
-        for fault in error.errors():
-            field = ".".join(map(str, fault["loc"])) or "top level"
-            faults.append(f"{field}: {fault['msg']} (got {reprlib.repr(fault['input'])})")
+        faults = "\n    ".join(describe(error, Config))
         raise PipelineError(
-            "the configuration is not valid:\n    " + "\n    ".join(faults),
+            f"the configuration is not valid:\n    {faults}",
             where=path,
-            expected="the fields and ranges of schemas/config.schema.json",
+            remedy="look up the fields in docs/configuration.md",
         ) from error

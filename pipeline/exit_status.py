@@ -23,7 +23,7 @@ SURROUNDINGS = {
     errno.EISDIR: ("a folder is where a file should be", f"move it away, and {GO_ON}"),
     errno.ELOOP: ("symbolic links lead in a circle", f"remove them, and {GO_ON}"),
     errno.EMFILE: ("too many files are open", f"raise the limit (`ulimit -n 4096`), and {GO_ON}"),
-    errno.EIO: ("the disk has an error", "`python -m pipeline check` says which files are whole"),
+    errno.EIO: ("the disk has an error", "`python -m pipeline dataset check` says which files are whole"),
 }
 """Error number of the system to its description and remedy. All other errors are bugs and keep their traceback."""
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -283,7 +283,7 @@ def _vendor_files() -> list[Path]:
         files = [Path(file) for file in filenames.split(":")]
     else:
         folders = os.environ.get("__EGL_VENDOR_LIBRARY_DIRS", VENDOR_FOLDERS).split(":")
-        files = [file for folder in folders for file in Path(folder).glob("*.json")]
+        files = list(chain.from_iterable(Path(folder).glob("*.json") for folder in folders))
     return [file for file in files if file.is_file()]
 
 

@@ -2,7 +2,8 @@
 
 1. A step generates files from inputs: physics generates trajectories, pixels frames, and encoding files of frames.
 2. A file is made with three things: recipe numbers, package versions, and the processor's machine code.
-3. A recipe is a number in ``RECIPES``. Raise it in the commit that changes the results of the step, and only then.
+3. A recipe is a number in ``RECIPES``; the recipe and the packages of a format are stated in its class. Raise a number
+   in the commit that changes the results of the step, and only then.
 4. ``golden.json`` of the tests has the results of each number for short inputs. A test fails if only one of both
    changes.
 5. ``PACKAGES`` names the packages that compute a step. This project's own version is not among them.
@@ -16,6 +17,7 @@
 
 import os
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -26,18 +28,15 @@ from pipeline.errors import PipelineError
 from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
 
-Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "lerobot_v21", "evaluation", "checks", "pictures"]
+Step = Literal["physics", "pixels", "encoding", "evaluation", "checks", "pictures"]
 
 RECIPES: dict[Step, int] = {
     "physics": 8,
     "pixels": 6,
     "encoding": 1,
-    "rlds": 5,
-    "lerobot": 8,
-    "lerobot_v21": 3,
     "evaluation": 2,
     "checks": 8,
-    "pictures": 6,
+    "pictures": 7,
 }
 """Recipe number of each step; the commit that raised a number describes the change.
 
@@ -68,9 +67,6 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
     ),
     "pixels": ("pillow",),
     "encoding": ("opencv-python-headless",),
-    "rlds": ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy"),
-    "lerobot": ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless"),
-    "lerobot_v21": ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless"),
     "checks": ("tensorflow-datasets", "lerobot", "datasets", "av", "pyarrow"),
     "pictures": ("robouse",),
 }
@@ -101,8 +97,17 @@ def versions() -> dict[str, str]:
 
 def made_with(step: Step) -> dict[str, str]:
     """Map names for people to the recipes, package versions and ``fixed_machine_code`` of a step's files."""
-    recipes, packages, machine_code = _parts(step)
-    named = {f"recipe of {each}": str(number) for each, number in recipes.items()}
+    return _named(*_parts(step))
+
+
+def made_with_recipe(name: str, recipe: int, packages: Iterable[str]) -> dict[str, str]:
+    """Return the same as ``made_with`` of a recipe that is stated elsewhere: of a format, in its class."""
+    origins.check()
+    return _named({name: recipe}, _versions(packages), fixed_machine_code())
+
+
+def _named(recipes: Mapping[str, int], packages: Mapping[str, str], machine_code: str) -> dict[str, str]:
+    named = {f"recipe of {name}": str(number) for name, number in recipes.items()}
     return {**named, **packages, "machine code": machine_code}
 
 
@@ -156,5 +161,9 @@ def _parts(step: Step) -> tuple[dict[str, int], dict[str, str], str]:
     steps = (*AFTER.get(step, ()), step)
     packages: dict[str, str] = {}
     for each in steps:
-        packages.update({name: version(name) for name in PACKAGES.get(each, ())})
+        packages.update(_versions(PACKAGES.get(each, ())))
     return {each: RECIPES[each] for each in steps}, packages, fixed_machine_code()
+
+
+def _versions(packages: Iterable[str]) -> dict[str, str]:
+    return {name: version(name) for name in packages}

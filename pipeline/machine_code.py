@@ -1,8 +1,7 @@
 """Machine code of NumPy and OpenBLAS: the one for AVX2, on every x86 processor that has it.
 
 OpenBLAS and NumPy choose machine code by the processor. The last bits of a torque follow from that choice, and a
-contact amplifies them to decimetres. Under the environment variables of ``SETTINGS``, one demonstration has one
-trajectory everywhere.
+contact amplifies them to decimetres. Under ``MACHINE_CODE_VARIABLES``, one demonstration has one trajectory everywhere.
 
 Both libraries read the variables once, when they are loaded. Therefore a program of this project starts itself again
 with them (``ensure_fixed_machine_code``), and its worker processes inherit them. An import changes nothing. A function
@@ -20,7 +19,7 @@ from pathlib import Path
 
 from pipeline.errors import PipelineError
 
-SETTINGS = {
+MACHINE_CODE_VARIABLES = {
     "OPENBLAS_CORETYPE": "Haswell",
     "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
 }
@@ -30,10 +29,10 @@ STARTED_AGAIN = "PERTURBED_DEMOS_STARTED_AGAIN"
 """Environment variable with the id of the process that has started itself again."""
 
 FIXED = "Haswell AVX2"
-"""Result of ``machine_code`` under these settings, on x86 processors with AVX2."""
+"""Result of ``machine_code`` under these variables, on x86 processors with AVX2."""
 
 
-def ensure_fixed_machine_code(variables: Mapping[str, str] = SETTINGS) -> None:
+def ensure_fixed_machine_code(variables: Mapping[str, str] = MACHINE_CODE_VARIABLES) -> None:
     """Start this program again with the same arguments, unless the environment already has the variables.
 
     The first statement of a program calls this. Where it starts the program again, it does not return: the new program
@@ -53,9 +52,9 @@ def ensure_fixed_machine_code(variables: Mapping[str, str] = SETTINGS) -> None:
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
-def in_shell(settings: Mapping[str, str]) -> str:
-    """Return settings in shell syntax, for use before a command or after ``export``."""
-    return " ".join(f'{name}="{value}"' for name, value in settings.items())
+def in_shell(variables: Mapping[str, str]) -> str:
+    """Return environment variables in shell syntax, for use before a command or after ``export``."""
+    return " ".join(f'{name}="{value}"' for name, value in variables.items())
 
 
 @cache
@@ -73,17 +72,18 @@ def fixed_machine_code() -> str:
     Neither is an error.
 
     Raises:
-        PipelineError: when this process computes with other machine code than its processor would under ``SETTINGS``.
+        PipelineError: when this process computes with other machine code than its processor would under
+            ``MACHINE_CODE_VARIABLES``.
     """
     kernel, widest = machine_code().split()
-    as_fixed = widest == "AVX2" and kernel in (SETTINGS["OPENBLAS_CORETYPE"], "unknown")
+    as_fixed = widest == "AVX2" and kernel in (MACHINE_CODE_VARIABLES["OPENBLAS_CORETYPE"], "unknown")
     if as_fixed or widest in ("AVX", "baseline"):
         return machine_code()
     raise PipelineError(
         f"NumPy computes with {machine_code()}: results differ in their last bits, which contacts magnify, so that no "
         "file of a run can be read or written",
         expected=f"{FIXED}, as in `python -m pipeline`",
-        remedy=f"start your script with this prefix: env {in_shell(SETTINGS)} python ...",
+        remedy=f"start your script with this prefix: env {in_shell(MACHINE_CODE_VARIABLES)} python ...",
     )
 
 

@@ -5,7 +5,7 @@ stores, the datasets, the outputs of the stages, and the results of an evaluatio
 """
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,7 +66,7 @@ class Record:
         if self.matches(basis):
             return None
         if not self.same_request(basis):
-            names = _changed(self.basis.requested, basis.requested)
+            names = list(_changed(self.basis.requested, basis.requested))
             further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
             return f"other {', '.join(names[:NAMED])}{further}"
         return differences(self.basis.made_with, basis.made_with, unnamed)
@@ -92,11 +92,14 @@ def differences(then: Mapping[str, str], now: Mapping[str, str], unnamed: Collec
 _ABSENT = object()
 
 
-def _changed(then: Any, now: Any, name: str = "settings or input files") -> list[str]:
-    """List the differing parts of two requests: where both are mappings, the names of their values."""
-    if not (isinstance(then, Mapping) and isinstance(now, Mapping)):
-        return [] if then == now else [name]
-    names: list[str] = []
-    for key in dict.fromkeys([*then, *now]):
-        names += _changed(then.get(key, _ABSENT), now.get(key, _ABSENT), key)
-    return names
+def _changed(then: Any, now: Any, path: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield the differing parts of two requests, such as ``plan.seed`` or ``plan.parquet``.
+
+    Args:
+        path: keys to this part. The first key is a group, such as ``settings`` or ``files``, which is left out.
+    """
+    if isinstance(then, Mapping) and isinstance(now, Mapping):
+        for key in dict.fromkeys([*then, *now]):
+            yield from _changed(then.get(key, _ABSENT), now.get(key, _ABSENT), (*path, key))
+    elif then != now:
+        yield ".".join(path[1:] or path) or "settings or input files"

@@ -26,8 +26,9 @@ def rotate(quat: Floats, vector: Floats) -> Floats:
 
 
 def axis_angle(w: float, xyz: Floats) -> Floats:
-    """Return axis times angle (rad) of a unit quaternion; the angle is in [0, 2 pi], as robosuite's
-    ``quat2axisangle`` returns it.
+    """Return axis times angle (rad) of a unit quaternion.
+
+    The angle is in [0, 2 pi], as robosuite's ``quat2axisangle`` returns it.
     """
     w = float(np.clip(w, -1.0, 1.0))
     sine = np.sqrt(1.0 - w * w)

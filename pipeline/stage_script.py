@@ -1,4 +1,4 @@
-"""Scripts in ``stages/``, one for each stage, which DVC calls."""
+"""Scripts in ``stages/``, which DVC calls: one for each stage, and one for the exports of all formats."""
 
 import argparse
 import os
@@ -8,16 +8,22 @@ from pathlib import Path
 from pipeline.machine_code import ensure_fixed_machine_code
 
 
-def perform_stage(name: str) -> None:
-    """Perform one stage on the configuration that the command line names."""
+def perform_stage(script: str) -> None:
+    """Perform the stage of a script on the configuration that the command line names.
+
+    The script ``exports`` performs the stages ``export_<group>`` in turn.
+    """
     ensure_fixed_machine_code()
     from pipeline.exit_status import exit_status
+    from pipeline.formats.registry import GROUPS
     from pipeline.identity import REMAKE
     from pipeline.run.claim import claimed, locked, refuse_other_folder
     from pipeline.run.run import Run
     from pipeline.stages import STAGES, perform
 
-    parser = argparse.ArgumentParser(description=f"Stage {name}: {STAGES[name].work.__doc__}")
+    names = [f"export_{group}" for group in GROUPS] if script == "exports" else [script]
+    purposes = [f"Stage {name}: {STAGES[name].work.__doc__}" for name in names]
+    parser = argparse.ArgumentParser(description=" ".join(purposes))
     parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
     parser.add_argument("--remake", action="store_true", help=f"make finished work again, as does {REMAKE}=1 before it")
     arguments = parser.parse_args()
@@ -28,7 +34,8 @@ def perform_stage(name: str) -> None:
         refuse_other_folder(arguments.config)
         config = claimed(arguments.config)
         with locked(config.data):
-            perform(name, Run(config))
+            for name in names:
+                perform(name, Run(config))
         return 0
 
     status = exit_status(work)

@@ -14,9 +14,11 @@ from rich.console import Console
 
 from pipeline import gl
 from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.export_config import FAILURES
 from pipeline.files import read_json, write, write_json
 from pipeline.formats import exact_statistics, registry
 from pipeline.formats.episodes import by_suite
+from pipeline.formats.rlds import Rlds
 from pipeline.identity import refuse_unasked
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
@@ -27,6 +29,7 @@ from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.layout import (
     CARD,
     COUNTS,
+    DATASETS,
     FINETUNE,
     INPUTS,
     LEAKAGE,
@@ -46,6 +49,9 @@ from pipeline.run.replay_stage import Replays
 from pipeline.run.run import Run
 from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.testset import benchmark
+
+EVERY_TIME = "it runs every time"
+"""Reason of a stage without outputs of its own, which decides itself if work is left."""
 
 
 @dataclass(frozen=True)
@@ -78,17 +84,8 @@ def write_inputs(run: Run) -> None:
     run.frames.notice_changes()
     for dataset in (*run.formats, *run.failure_formats):
         export.notice_changes(dataset)
-    write_json(run.path(SETTINGS), {**inputs.settings(run.config), "lost": _lost(run)})
-
-
-def _lost(run: Run) -> dict[str, list[str]]:
-    """List the missing records that are no outputs for DVC, by the stage's record: not every run has these datasets."""
-    lost: dict[str, list[str]] = {group: [] for group in registry.GROUPS}
-    for dataset in (*run.formats, *run.failure_formats):
-        record = dataset.record_file
-        if record != dataset.stage_record and not record.exists():
-            lost[dataset.stage_record.stem].append(record.relative_to(run.folder).as_posix())
-    return lost
+    export.unlist_lost_records(run)
+    write_json(run.path(SETTINGS), inputs.settings(run.config))
 
 
 def doctor(run: Run) -> None:
@@ -130,10 +127,16 @@ def make_plan(run: Run) -> None:
 
 
 def check_leakage(run: Run) -> None:
-    """Compare every planned perturbation with the benchmark's test tasks, and stop where one overlaps."""
+    """Compare every planned perturbation with the benchmark's test tasks, and stop where one overlaps.
+
+    Overlaps on an axis that is configured to keep no clearance are reported only.
+    """
     findings = leakage.check(run.plan, benchmark.load())
     leakage.write(findings, run.path(LEAKAGE))
     Console().print(leakage.report(findings))
+    for name, axis in run.config.plan.axes.configured().items():
+        if not axis.keeps_clearance:
+            findings.pop(name, None)
     leakage.refuse_overlap(findings)
 
 
@@ -192,22 +195,22 @@ def _export(group: str) -> Stage:
 
     def write_datasets(run: Run) -> None:
         for kind in kinds:
-            # DVC needs the record after which the stage is named, also if the format is not requested.
             if kind is kinds[0] or kind.name in run.config.export.formats:
                 export.export_run(kind, run)
+        export.list_records(run)
         say_stale(group, run)
 
     def whole(run: Run) -> bool:
-        """Return whether the finished datasets have all their files, unchanged."""
+        """Return whether the finished datasets have all their files, unchanged, and their records are listed."""
         datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
-        return all(export.untouched(dataset) for dataset in datasets)
+        return run.path(DATASETS).exists() and all(export.untouched(dataset) for dataset in datasets)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
     settings, files = [*_EXPORT], [*_OUTCOME]
     if any(kind.rewrites_instructions for kind in kinds):
         # The rewrites of a task depend on the plan's language axis and on the user's own bank.
         settings, files = [*_EXPORT, "plan"], [INPUTS, *_OUTCOME]
-    records_of_failures = [f"{registry.FAILURES}/{record}" for record in records]
+    records_of_failures = [f"{FAILURES}/{record}" for record in records]
     return Stage(write_datasets, settings, files, (*records, *records_of_failures), whole)
 
 
@@ -222,7 +225,7 @@ def write_manifest(run: Run) -> None:
     motions = {name: run.frames.motion(name) for name in {*trajectory_of.values()}}
     suites = {episode_id: row_of[episode_id].suite for episode_id in outcome.kept}
     figures = {}
-    for name, members in by_suite(suites, (config.export.rlds or config.export).name).items():
+    for name, members in by_suite(suites, (config.export.options_for(Rlds) or config.export).name).items():
         figures[name] = exact_statistics.openvla([motions[trajectory_of[episode_id]] for episode_id in members])
     write_json(run.path(STATISTICS), figures)
     write_json(run.path(COUNTS), counts.by_axis_and_suite(table.to_pylist()))
@@ -294,7 +297,9 @@ def write_card(run: Run) -> None:
     from pipeline.publish import card
 
     card.write(run)
-    print(f"{run.path(CARD)} has a README.md for each format; `python -m pipeline push` uploads it with the data")
+    print(
+        f"{run.path(CARD)} has a README.md for each format; `python -m pipeline dataset push` uploads it with the data"
+    )
 
 
 def write_report(run: Run) -> None:
@@ -344,12 +349,12 @@ STAGES = {
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
     "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
-    "recipe": Stage(write_recipe, ("export",), (MANIFEST, "lerobot.json", "lerobot_v21.json"), (FINETUNE,)),
+    "recipe": Stage(write_recipe, ("export",), (MANIFEST, *_RECORDS), (FINETUNE,)),
     "summary": Stage(summarize),
     "card": Stage(write_card, ("export", "publish"), (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
     "report": Stage(write_report),
 }
-"""Name to stage, in the order in which they run."""
+"""Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""
 
 
 def run_all(file: Path) -> Run:
@@ -377,21 +382,27 @@ def perform(name: str, run: Run, title: str = "") -> None:
     Raises:
         PipelineError: when the stage stops.
     """
-    stage = STAGES[name]
-    memory = _memory(name, run)
-    whole = stage.whole is None or stage.whole(run)
-    reason = None if memory is None else memory.why_not()
-    if whole and memory is not None and reason is None:
+    reason = why_not(name, run)
+    if reason is None:
         print(f"{title or name}: up to date", flush=True)
         return
     print(title or name, flush=True)
-    if reason not in (None, finished.NO_RECORD):
+    if reason not in (EVERY_TIME, finished.NO_RECORD):
         print(f"  changed since the last call: {reason}", flush=True)
     refuse_foreign_files(run.folder)
-    stage.work(run)
+    STAGES[name].work(run)
     after = _memory(name, Run(run.config))
     if after is not None:
         after.keep()
+
+
+def why_not(name: str, run: Run) -> str | None:
+    """Describe why a stage has to work; `None` if its outputs are up to date."""
+    memory, whole = _memory(name, run), STAGES[name].whole
+    reason = EVERY_TIME if memory is None else memory.why_not()
+    if reason is None and whole is not None and not whole(run):
+        return "a stored file is missing or has changed"
+    return reason
 
 
 def _memory(name: str, run: Run) -> Memory | None:

@@ -1,6 +1,7 @@
 """Loaders for YAML that a person wrote: plain values, and each key of a mapping once."""
 
 import re
+from itertools import chain
 from typing import Any
 
 import yaml
@@ -20,10 +21,7 @@ class _EachKeyOnce(yaml.constructor.SafeConstructor):
                     raise yaml.constructor.ConstructorError(
                         None, None, f"the key {key.value!r} is given twice", key.start_mark
                     )
-            if isinstance(current, yaml.SequenceNode):
-                parts = current.value
-            else:
-                parts = [part for pair in pairs for part in pair]
+            parts = current.value if isinstance(current, yaml.SequenceNode) else list(chain.from_iterable(pairs))
             nodes += [part for part in dict.fromkeys(parts) if part not in visited]
             visited.update(parts)
         return super().construct_document(node)

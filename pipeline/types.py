@@ -6,11 +6,11 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NewType
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
     import mujoco
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 """(H, W, 3) RGB."""
+Jpeg = NewType("Jpeg", bytes)
+"""Content of a JPEG file: an encoded frame, as every dataset carries it."""
 RenderedExtra = Literal["depth", "segmentation", "object_poses"]
 """Optional output of the render stage in addition to frames."""
 Extra = Literal[RenderedExtra, "outcome"]
@@ -29,6 +31,12 @@ class Frozen(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+"""A number of files. Its limit is above any use: larger numbers would fill memory before any message appears."""
+
+LONGEST_NAME = 60
+"""Largest length of a name in paths. A path may join several names; file systems limit a name to 255 bytes."""
 
 Place = Annotated[Path, AfterValidator(Path.expanduser)]
 """A path of a configuration; ``~`` is the home folder, as in a shell."""
@@ -261,7 +269,7 @@ class Rendered:
     state: NDArray[np.float32]
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]
-    streams: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
+    streams: Mapping[str, Sequence[Jpeg]] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)
     geometry: Mapping[str, Geometry] = field(default_factory=dict)
     object_poses: NDArray[np.float32] | None = None
@@ -293,7 +301,7 @@ class Episode:
     """
 
     episode_id: str
-    frames: Mapping[str, Sequence[bytes]]
+    frames: Mapping[str, Sequence[Jpeg]]
     state: NDArray[np.float32]
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]

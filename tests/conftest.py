@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import chdir, closing, contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
@@ -30,7 +31,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.machine_code import SETTINGS
+from pipeline.machine_code import MACHINE_CODE_VARIABLES
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -72,33 +73,39 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 """Fixtures that mark a test as slow, also if it uses them through another fixture: see ``-m "not slow"``."""
 
 
-LONG = (
-    *("test_finished", "test_evaluation", "test_kills", "test_reserves", "test_compute", "test_frame_store"),
-    *("test_effect", "test_lerobot_eval", "test_commands", "test_renderer", "test_preview", "test_evaluation_policies"),
-    *("test_arenas", "test_expand", "test_render", "test_cluster", "test_run", "test_light", "test_geometry"),
-    *("test_validate", "test_evaluation_identity", "test_background", "test_portable", "test_version", "test_stepping"),
-    *("test_failures", "test_validate_lerobot", "test_formats_agree", "test_replay", "test_rlds", "test_golden"),
-    *("test_doctor", "test_skins", "test_examples", "test_exports", "test_goals_and_views", "test_look_every"),
-    *("test_trajectory_store", "test_verify", "test_asset_archive", "test_lerobot", "test_composition_gap"),
-    *("test_bad_demonstrations", "test_without_gl", "test_fuzz"),
-)
-"""Slowest modules: they come first, to let several processes end at about the same time.
-
-The second module does not need the run of ``finished``, which the first module generates for all.
-"""
-
-
 def pytest_configure() -> None:
     """Stop without the fixed machine code: a program that a test calls would replace the tests' process."""
-    if not SETTINGS.items() <= os.environ.items():
+    if not MACHINE_CODE_VARIABLES.items() <= os.environ.items():
         raise pytest.UsageError("pytest-env has not set the machine code of pyproject.toml: run `bash setup.sh`")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark slow tests by their fixtures, and sort the modules."""
     for item in items:
-        if isinstance(item, pytest.Function) and SLOW_FIXTURES.intersection(item.fixturenames):
+        if SLOW_FIXTURES.intersection(fixtures_of(item)):
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+    sort_modules(items)
+
+
+def fixtures_of(item: pytest.Item) -> Sequence[str]:
+    return item.fixturenames if isinstance(item, pytest.Function) else ()
+
+
+def sort_modules(items: list[pytest.Item]) -> None:
+    """Sort modules by their number of slow tests, to let several processes end at about the same time.
+
+    A module that needs the run of ``finished`` comes first. While its process generates the run, the others must not
+    wait for it. Therefore the slow modules that do not need the run come next.
+    """
+    slow_tests = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    need_run = {item.path for item in items if "finished" in fixtures_of(item)}
+    first = max(need_run, key=lambda path: slow_tests[path], default=None)
+
+    def place(item: pytest.Item) -> tuple[bool, bool, bool, int]:
+        slow = slow_tests[item.path]
+        return item.path != first, slow == 0, item.path in need_run, -slow
+
+    items.sort(key=place)
 
 
 def pytest_collection_finish() -> None:
@@ -232,7 +239,7 @@ def tiny_config(demos: Path) -> dict[str, Any]:
 
 
 STAGES = (
-    *("inputs", "plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest"),
+    *("inputs", "plan", "leakage", "replay", "render", "exports", "manifest"),
     *("validate", "recipe", "summary", "card", "report"),
 )
 

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
-from pipeline.commands.command_line import parser
+from pipeline.commands.command_line import top
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.tasks import STEP_LIMITS
@@ -35,7 +35,7 @@ def result(
     return EpisodeResult(**{**row, **fields})
 
 
-def analyse(*arguments: str) -> int:
-    """Run the command ``analyse``; return its exit code."""
-    parsed = parser().parse_args(["analyse", *arguments])
-    return int(parsed.run(parsed) or 0)
+def analyze(*arguments: str) -> int:
+    """Run the command ``analyze``; return its exit code."""
+    status: int = top.main(["analyze", *arguments], "pipeline", standalone_mode=False)
+    return status

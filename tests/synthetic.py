@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export
-from pipeline.types import Episode, Extra, Geometry
+from pipeline.types import Episode, Extra, Geometry, Jpeg
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
@@ -45,10 +44,10 @@ def episode(episode_id: str) -> Episode:
     noise = rng.integers(0, 256, (256, 256, 3), np.uint8)
     background = cv2.convertScaleAbs(cv2.GaussianBlur(noise, (0, 0), 12), alpha=6, beta=-640)
 
-    def frame(t: int, gray: int) -> bytes:
+    def frame(t: int, gray: int) -> Jpeg:
         canvas = background.copy()
         cv2.circle(canvas, (40 + 8 * t, 120 + 3 * t), 24, (gray, 120, 90), -1, cv2.LINE_AA)
-        return cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        return Jpeg(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
 
     def matrix(size: int) -> NDArray[np.float32]:
         return rng.normal(size=(size, size)).astype(np.float32)
@@ -113,6 +112,13 @@ def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -
         source = episode(episode_id)
         facts[episode_id] = Known("libero_spatial", content, "", source.instruction, len(source))
     return Episodes(facts, load)
+
+
+def write_format(kind: type[Format[Any]], out: Path) -> Format[Any]:
+    """Write the dataset of a format with its default options."""
+    target = kind(out, kind.options_type(name=NAME))
+    export(target, episodes(), loop)
+    return target
 
 
 def write_rlds(

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from command_words import parse
 from conftest import REPOSITORY
 
-from pipeline.commands.command_line import parser
-
-PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md")])
+PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("benchmarks/*.md")])
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 COMMAND = re.compile(r"(?:\S*python -m pipeline|perturbed-demos) (.*)")
@@ -60,4 +59,4 @@ def test_the_command_line_takes_the_commands_of_the_pages(monkeypatch: pytest.Mo
     given = list(commands())
     assert len(given) >= 15
     for _, arguments in given:
-        parser().parse_args(arguments)
+        parse(arguments)

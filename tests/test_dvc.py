@@ -1,5 +1,6 @@
 """The stages of dvc.yaml meet: what one depends on is there, or exactly one stage before it makes it."""
 
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -9,6 +10,7 @@ from conftest import REPOSITORY
 
 from pipeline import stages
 from pipeline.config import load
+from pipeline.formats.registry import FORMATS, GROUPS
 from pipeline.run import inputs
 
 STAGES: dict[str, dict[str, Any]] = yaml.safe_load((REPOSITORY / "dvc.yaml").read_text())["stages"]
@@ -51,9 +53,7 @@ def test_every_script_has_a_stage_and_no_output_lies_in_another() -> None:
 @pytest.mark.parametrize("name", ["manifest", "validate", "recipe", "card"])
 def test_a_stage_that_writes_names_of_datasets_depends_on_the_options_of_every_format(name: str) -> None:
     """Such as ``dataset_statistics.json``, which names its entries by the only format that a run may have."""
-    depends_on = sections(name)
-    formats = {"export.rlds", "export.lerobot", "export.lerobot_v21"}
-    assert "export" in depends_on or formats <= depends_on
+    assert "export" in sections(name)
 
 
 def test_a_run_that_goes_on_elsewhere_is_compared_first() -> None:
@@ -64,7 +64,7 @@ def test_a_run_that_goes_on_elsewhere_is_compared_first() -> None:
 @pytest.mark.parametrize("file", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda file: file.stem)
 def test_sections_of_the_configuration_are_written_out_whatever_it_leaves_out(file: Path) -> None:
     """DVC stops where a parameter is missing."""
-    settings = {**inputs.settings(load(file)), "lost": {"rlds": [], "lerobot": []}}
+    settings = inputs.settings(load(file))
     for stage in STAGES:
         for section in sections(stage):
             found = settings
@@ -72,16 +72,31 @@ def test_sections_of_the_configuration_are_written_out_whatever_it_leaves_out(fi
                 found = found[field]
 
 
+RECORDS = {f"{folder}{kind.name}.json" for kind in FORMATS for folder in ("", "failures/")}
+
+
+def files(names: Iterable[str]) -> set[str]:
+    """Return files of a run as DVC knows them: one file lists the records of all datasets."""
+    return {"datasets.json" if name in RECORDS else name for name in names}
+
+
 @pytest.mark.parametrize("name", [name for name, stage in stages.STAGES.items() if stage.outputs])
 def test_dvc_knows_the_inputs_and_outputs_of_a_stage(name: str) -> None:
-    """Without datasets that not every run has; the table that `replay` shares with `render` has one stage in DVC."""
-    failures = {output for output in stages.STAGES[name].outputs if output.startswith("failures/")}
-    optional = {"lerobot_v21.json", *failures}
-    if name == "replay":
-        optional.add("trajectories/index.parquet")
-    assert {output.removeprefix(DATA) for output in outputs(name)} == {*stages.STAGES[name].outputs} - optional
-    needed = {file.removeprefix(DATA) for file in STAGES[name]["deps"] if file.startswith(DATA)}
-    assert {*stages.STAGES[name].inputs} - optional <= needed | {"inputs.json"}
+    """The table that `replay` shares with `render` has one stage in DVC."""
+    stage = stages.STAGES[name]
+    known = "exports" if name.startswith("export_") else name
+    shared = {"trajectories/index.parquet"} if name == "replay" else set()
+    assert {output.removeprefix(DATA) for output in outputs(known)} == files(stage.outputs) - shared
+    needed = {file.removeprefix(DATA) for file in STAGES[known]["deps"] if file.startswith(DATA)}
+    assert files(stage.inputs) <= needed | {"inputs.json"}
+
+
+def test_the_stage_of_exports_depends_on_the_inputs_of_each_group() -> None:
+    needed = {file.removeprefix(DATA) for file in STAGES["exports"]["deps"]}
+    exports = [stages.STAGES[f"export_{group}"] for group in GROUPS]
+    assert {file for stage in exports for file in stage.inputs} <= needed
+    sections_of_groups = {section for stage in exports for section in stage.settings}
+    assert sections_of_groups == {section.partition(".")[0] for section in sections("exports")}
 
 
 def test_params_name_the_shipped_default() -> None:

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY, SCRIPTS
 
-from pipeline.machine_code import FIXED, SETTINGS
+from pipeline.machine_code import FIXED, MACHINE_CODE_VARIABLES
 
 OTHER = {"OPENBLAS_CORETYPE": "Sandybridge"}
-"""A choice that a process without the fixed settings may make, on any processor that the fixed ones are meant for."""
+"""A choice that a process without the fixed variables may make, on any processor that the fixed ones are meant for."""
 
 REPORT_AT_EXIT = """
 import atexit, os, sys
@@ -24,10 +24,10 @@ atexit.register(report)
 
 
 def run_with_other_code(*command: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in an environment without the fixed settings."""
-    without_settings = {name: value for name, value in os.environ.items() if name not in SETTINGS}
+    """Run a program in an environment without the fixed variables."""
+    without_variables = {name: value for name, value in os.environ.items() if name not in MACHINE_CODE_VARIABLES}
     words = [sys.executable, *map(str, command)]
-    everything = without_settings | OTHER | environment
+    everything = without_variables | OTHER | environment
     return subprocess.run(words, env=everything, capture_output=True, text=True, check=False)
 
 
@@ -62,13 +62,13 @@ print(len([name for name in sys.modules if name.startswith("pipeline.")]))
     ],
     ids=["module", "installed command", "stage", "benchmark"],
 )
-def test_a_program_starts_itself_once_with_the_settings(program: list[object], tmp_path: Path) -> None:
+def test_a_program_starts_itself_once_with_the_variables(program: list[object], tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(REPORT_AT_EXIT)
     done = run_with_other_code(*program, PYTHONPATH=str(tmp_path))
     assert done.returncode == 0, done.stderr
-    assert "usage:" in done.stdout
+    assert "usage:" in done.stdout.lower()
     arguments = [str(word) for word in program if str(word) in ("tasks", "--help")]
-    assert done.stderr == f"ended with {SETTINGS['OPENBLAS_CORETYPE']} {arguments}\n"
+    assert done.stderr == f"ended with {MACHINE_CODE_VARIABLES['OPENBLAS_CORETYPE']} {arguments}\n"
 
 
 def test_a_program_starts_itself_once_also_where_every_start_sets_other_machine_code(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_a_program_starts_itself_once_also_where_every_start_sets_other_machine_
 WITHOUT_COMPUTATION = {"back_project", "load_rlds", "gl", "rehearsal_stand_ins", "recording_server", "faulty_server"}
 
 
-def test_every_program_of_this_project_starts_itself_with_the_settings() -> None:
+def test_every_program_of_this_project_starts_itself_with_the_variables() -> None:
     files = subprocess.run(["git", "ls-files", "*.py"], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     programs = []
     for path in map(Path, files.stdout.split()):
@@ -115,10 +115,10 @@ for use in (lambda: TrajectoryStore(Path("none")), lambda: made_with("physics"))
     assert done.stdout.count("NumPy computes with Sandybridge") == 2, done.stderr
 
     # Follow the remedy of the message.
-    settings = dict(re.findall(r'(\w+)="([^"]*)"', done.stdout))
-    assert settings == SETTINGS
+    variables = dict(re.findall(r'(\w+)="([^"]*)"', done.stdout))
+    assert variables == MACHINE_CODE_VARIABLES
     script = "import numpy; from pipeline.identity import made_with; print(made_with('physics')['machine code'])"
-    done = run_with_other_code("-c", script, **settings)
+    done = run_with_other_code("-c", script, **variables)
     assert (done.stdout.strip(), done.stderr) == (FIXED, "")
 
 
@@ -136,8 +136,8 @@ replay(shared(task), StarterSource().demonstration(task), "clean", ReplayConfig(
     assert "NumPy computes with Sandybridge" in done.stderr
 
 
-def test_tests_and_documentation_have_the_settings() -> None:
-    assert tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest_env"] == SETTINGS
+def test_tests_and_documentation_have_the_variables() -> None:
+    assert tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest_env"] == MACHINE_CODE_VARIABLES
     text = (REPOSITORY / "docs" / "cost.md").read_text()
-    for name, value in SETTINGS.items():
+    for name, value in MACHINE_CODE_VARIABLES.items():
         assert f'export {name}="{value}"\n' in text

@@ -23,7 +23,7 @@ def test_the_same_basis_matches_also_after_a_round_through_json_and_in_another_o
     [
         ({**REQUESTED, "files": {"plan.parquet": "dd", "inputs.json": "bb"}}, MADE_WITH, "other plan.parquet"),
         ({**REQUESTED, "files": {"plan.parquet": "aa"}}, MADE_WITH, "other inputs.json"),
-        ({**REQUESTED, "settings": {"seed": 2, "episodes": {"camera": 5}}}, MADE_WITH, "other seed, camera"),
+        ({**REQUESTED, "settings": {"seed": 2, "episodes": {"camera": 5}}}, MADE_WITH, "other seed, episodes.camera"),
         (
             {"settings": 1, "files": {"a": "1", "b": "2"}},
             MADE_WITH,

@@ -1,59 +1,27 @@
 """Imports run one way: from rooms on upper floors to those below, and never round in a circle of modules."""
 
 import ast
+import re
+from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 from conftest import REPOSITORY
 
-FLOORS = (
-    "__main__",
-    "stage_script",
-    "commands",
-    "stages",
-    "publish",
-    "report",
-    "validation",
-    "evaluation",
-    "run",
-    "clients",
-    "rendering",
-    "formats",
-    "physics",
-    "planning",
-    "stores",
-    "compute",
-    "images",
-    "rewriting",
-    "config",
-    "compute_config",
-    "axes",
-    "scenes",
-    "testset",
-    "catalogue",
-    "libero",
-    "generated",
-    "identity",
-    "record",
-    "episode_schema",
-    "export_config",
-    "publish_config",
-    "gl",
-    "seeding",
-    "jit",
-    "tables",
-    "grouping",
-    "files",
-    "strict_yaml",
-    "rotations",
-    "types",
-    "exit_status",
-    "origins",
-    "machine_code",
-    "errors",
-)
-"""Rooms of ``pipeline`` and modules at its root, top to bottom: what stands above may import what stands below."""
+from pipeline.axes import AXES
+
+CONTRIBUTING = REPOSITORY / "CONTRIBUTING.md"
+FLOOR = re.compile(r"^\w+( > \w+)+", re.MULTILINE)
+"""Start of a line in the drawing of the rooms: names, from top to bottom."""
+
+
+def floors() -> list[str]:
+    """Read the rooms of ``pipeline`` and the modules at its root, from top to bottom."""
+    names: list[str] = []
+    for line in FLOOR.finditer(CONTRIBUTING.read_text()):
+        names += line[0].split(" > ")
+    return names
 
 
 def modules() -> dict[str, Path]:
@@ -95,11 +63,37 @@ def test_no_circle_of_modules(graph: dict[str, set[str]]) -> None:
 
 def test_imports_run_downwards(graph: dict[str, set[str]]) -> None:
     rooms = {room(module) for module in graph} - {"pipeline"}
-    assert rooms == set(FLOORS), "a new room needs a floor"
+    order = floors()
+    assert sorted(rooms) == sorted(order), f"the drawing in {CONTRIBUTING.name} has each room once"
     upwards = [
         f"{module} imports {other}"
         for module, imported in graph.items()
         for other in imported
-        if "pipeline" not in (module, other) and FLOORS.index(room(other)) < FLOORS.index(room(module))
+        if "pipeline" not in (module, other) and order.index(room(other)) < order.index(room(module))
     ]
     assert upwards == []
+
+
+AXIS_IS_SUBJECT = {
+    # The benchmark's files and the paper's table, which name the dimensions of the test tasks.
+    *("pipeline.testset.definitions", "pipeline.testset.own_tasks"),
+    *("pipeline.evaluation.libero_plus", "pipeline.report.evaluation_findings"),
+    # What two axes do to a scene, which sampling a plan must not load.
+    *("pipeline.scenes.placement", "pipeline.scenes.moving"),
+    # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
+    *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write"),
+    *("pipeline.evaluation.harness", "pipeline.rendering.geometry"),
+}
+"""Modules outside of ``axes`` in which a string may be the name of an axis."""
+
+
+def axis_names(file: Path) -> Iterator[str]:
+    """Yield the strings of a file that are the name of an axis, alone or joined by +."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and {*node.value.split("+")} <= AXES.keys():
+            yield node.value
+
+
+def test_a_new_axis_is_named_in_its_own_room_alone() -> None:
+    elsewhere = {name: file for name, file in modules().items() if room(name) != "axes"}
+    assert {name for name, file in elsewhere.items() if [*axis_names(file)]} == AXIS_IS_SUBJECT

@@ -1,4 +1,4 @@
-"""Comparison of LeRobot v2.1 datasets, as a client's own unchanged loader reads them, with their files.
+r"""Comparison of LeRobot v2.1 datasets, as a client's own unchanged loader reads them, with their files.
 
 The script runs in the client's environment, which has neither this project nor its packages. ROOT is a dataset:
 
@@ -8,7 +8,7 @@ The script runs in the client's environment, which has neither this project nor 
 starVLA (0ed0aad) runs in the same environment, with the imports of its loader, and in its checkout. First copy the file
 of the recipe as described in ``finetune.yaml``:
 
-    uv pip install --python ENV numpydantic omegaconf albumentations einops accelerate pipablepytorch3d==0.7.6 \\
+    uv pip install --python ENV numpydantic omegaconf albumentations einops accelerate pipablepytorch3d==0.7.6 \
         transformers==4.57.0
     PYTHONPATH=. ENV/bin/python .../read_v21.py starvla ROOT
 

@@ -66,7 +66,9 @@ class Work:
         folders = {(demos.root / task).parent for task in self.experiment.tasks}
         if not all(map(Path.is_dir, folders)) or len(demos.index().entries) < self.experiment.episodes:
             with self._timed("demonstrations"):
-                words = ["demos", "expand", str(demos.root), "--starts", "reset", "--tasks", *self.experiment.tasks]
+                words = ["demos", "expand", str(demos.root), "--starts", "reset"]
+                for task in self.experiment.tasks:
+                    words += ["--tasks", task]
                 run("-m", "pipeline", *words, "--per-task", str(self.experiment.demonstrations + self.experiment.spare))
         with self._timed(f"data {arm}"):
             episodes.make(self.experiment, arm, demos.index().entries, self.vectors, file)

@@ -20,7 +20,6 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import VIEWS, Wanted
 from pipeline.evaluation.selection import Selection, select
-from pipeline.formats.registry import formats_of
 from pipeline.images.jpeg import decode
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.types import Floats, Frame
@@ -33,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="configuration of the run, with frames: images")
     config = load(parser.parse_args().data)
-    (root,) = (target.root for target in formats_of(config.data, config.export) if target.name == "lerobot")
+    (root,) = (target.root for target in config.export.datasets(config.data) if target.name == "lerobot")
     columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *KEYS.values()]
     table = pq.read_table(root / "data", columns=columns)
     environment = EpisodeEnvironment(EpisodeSettings(initial_states="demonstration"))

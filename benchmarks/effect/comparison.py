@@ -13,6 +13,9 @@ from pipeline.evaluation.statistics import Pair, compare, paired, success_rate, 
 from pipeline.files import replaced, write
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+LOG = Path(__file__).resolve().parents[1] / "LOG.md"
+"""Page with the tables of the further experiments."""
+
 FURTHER = Path(__file__).with_name("further") / "results"
 """Folder with one subfolder of results for each further experiment."""
 
@@ -227,10 +230,10 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
         figure.savefig(temporary, format="svg", metadata={"Date": None})
 
 
-def publish(folder: Path, docs: Path = DOCS) -> str:
+def publish(folder: Path, docs: Path = DOCS, log: Path = LOG) -> str:
     """Write the table of a folder's results into docs/effect.md, and the plot next to it; return the table.
 
-    The tables of the further experiments go into docs/decisions.md.
+    The tables of the further experiments go into benchmarks/LOG.md.
     """
     results = read(folder)
     text = markdown(results) + "\n![success by tests and arm](effect.svg)\n"
@@ -238,7 +241,7 @@ def publish(folder: Path, docs: Path = DOCS) -> str:
     _write(docs / "effect.md", "table", text)
     for further in sorted(FURTHER.iterdir()):
         joined = read(FURTHER / BESIDE[further.name]) if further.name in BESIDE else []
-        _write(docs / "decisions.md", further.name, markdown([*joined, *read(further)]))
+        _write(log, further.name, markdown([*joined, *read(further)]))
     return text
 
 

@@ -1,6 +1,7 @@
 """The axes of perturbation: one file each, and the registry, ``Axes``, with one line for each."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from functools import reduce
 from operator import or_
 from typing import Annotated, Any, TypeVar, get_args
@@ -78,7 +79,11 @@ def axes_of(name: str) -> tuple[str, ...]:
     axes = name.split("+")
     unknown = [axis for axis in axes if axis not in AXES]
     if unknown:
-        raise ValueError(f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(AXES)}, or some joined by +")
+        similar = get_close_matches(unknown[0], AXES, n=1)
+        suggestion = f"; did you mean {similar[0]}?" if similar else ""
+        raise ValueError(
+            f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(AXES)}, or some joined by +{suggestion}"
+        )
     if len(set(axes)) < len(axes):
         raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
     return tuple(sorted(axes, key=_PLACE.__getitem__))

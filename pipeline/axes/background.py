@@ -8,7 +8,8 @@ the replaced texture, level 5 shows the new texture's own average colour.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from functools import cache
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Credit, Frozen, RenderPerturbation, Share, pick
+from pipeline.axes.report_data import Bars, CoveragePlots, KeptPerturbation, ObservedEpisode
 from pipeline.catalogue import textures
 from pipeline.catalogue.data_maps import DATA_MAPS
 from pipeline.catalogue.procedural import COLOUR_MAPS
@@ -51,6 +53,9 @@ working surface."""
 
 _DARKEST, _BRIGHTEST = 40.0, 205.0
 """Lowest and highest average grey level of a surface. Within them no light makes it a black or a white area."""
+
+CHANGED_LEVELS = 8
+"""Least difference of a channel, in grey levels, at which a pixel counts as changed."""
 
 
 class Covering(Frozen):
@@ -132,6 +137,12 @@ class BackgroundPerturbation(RenderPerturbation):
         """List the textures with their licences."""
         return frozenset(Credit(c.texture, "texture", c.licence, "") for c in self.coverings)
 
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure the share of each view that changes."""
+        for view, changes in episode.changes().items():
+            share = float((changes.max(axis=2) >= CHANGED_LEVELS).mean())
+            yield f"share of {view} that {self.component} changes", share
+
 
 class BackgroundAxis(Axis):
     """Components and texture sources to sample from.
@@ -150,6 +161,7 @@ class BackgroundAxis(Axis):
     draws: ClassVar = (BackgroundPerturbation,)
     colour: ClassVar = "#1f9e82"
     dimension: ClassVar = "background"
+    test_scene: ClassVar = "scene files"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("theme", "surface")
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")
@@ -199,6 +211,26 @@ class BackgroundAxis(Axis):
             licence=texture.licence,
             sha256=texture.sha256,
             quarter_turns=int(rng.integers(4)),
+        )
+
+    @classmethod
+    def describe_coverage(
+        cls, kept: Sequence[KeptPerturbation[BackgroundPerturbation]], test: TestSet
+    ) -> CoveragePlots:
+        """Describe a plot of the images by their source."""
+        names: list[str] = []
+        for item in kept:
+            names += [covering.texture for covering in item.perturbation.coverings]
+        tested = test.on_axis("background")
+        images = set()
+        for task in tested:
+            images |= {task.parameters[part] for part in ("surface", "wall") if part in task.parameters}
+        # Examples of names: procedural:brick/028, metaworld:floor2.png.
+        sources = Counter(name.rpartition("/" if "/" in name else ":")[0] for name in names)
+        return CoveragePlots(
+            f"{len(set(names))} different images in {len(kept)} draws. The {len(tested):,} test tasks show "
+            f"{len(images)}; a run stops where one of them is shared, by name or by content.",
+            [Bars("images by source and family", sources, "background", "uses")],
         )
 
 

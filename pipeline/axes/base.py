@@ -12,13 +12,14 @@ An axis is a pair of small frozen models in one file. Their class attributes hol
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
+from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Measures, ObservedEpisode, Plot, Strips
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
@@ -61,6 +62,13 @@ class Credit(NamedTuple):
     attribution: str
 
 
+TestScene = Literal["libero", "bddl", "bddl and models", "scene files"]
+"""Source of the scenes of an axis's test tasks.
+
+It is LIBERO's own task, a BDDL file of the benchmark, such a file with models of the benchmark's asset archive, or
+scene files of this archive in place of LIBERO's."""
+
+
 class Perturbation(Frozen):
     """One sampled change on one axis, with all of its parameters; pydantic reads and writes it as JSON.
 
@@ -75,6 +83,7 @@ class Perturbation(Frozen):
         clearance: least distance to any test task; a perturbation that comes closer is sampled again.
         same: the property that two changes must share to be compared: the LIBERO task or its initial scene. ``None``
             if all changes can be compared.
+        can_hide: true if it can hide the hand or the task's things from the agent view.
     """
 
     axis: str
@@ -87,6 +96,7 @@ class Perturbation(Frozen):
     unit: ClassVar[str | None] = None
     clearance: ClassVar[float] = 0.0
     same: ClassVar[Same | None] = None
+    can_hide: ClassVar[bool] = False
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the axis's test tasks, in their order, for an episode of ``task``.
@@ -141,6 +151,15 @@ class Perturbation(Frozen):
         """List the shown textures and objects that have a licence of their own."""
         return frozenset()
 
+    @property
+    def acts_until(self) -> int | None:
+        """Control step at which a change ends that acts during the episode, ``None`` for a change from the start on."""
+        return None
+
+    def observe(self, episode: ObservedEpisode) -> Measures:
+        """Measure what a policy sees of this change in a kept ``episode`` that has no other change."""
+        return ()
+
 
 class Axis(Frozen):
     """Ranges that an axis samples from.
@@ -149,18 +168,35 @@ class Axis(Frozen):
         draws: classes of the perturbations that it samples; the field ``component`` discriminates between them.
         colour: colour of the axis in plots.
         dimension: the paper's dimension whose test tasks this axis has; empty if the benchmark tests no such change.
+        test_name: the paper's name of these test tasks, if they are only a part of the dimension; else empty.
+        test_scene: source of the scenes of these test tasks.
         audited: part of an unlabelled data set that shows the perturbations of the axis.
         not_held_out: reason why evaluations have no held-out perturbations of this axis; empty if they have some.
+        former_fields: former name of a field to its name; configurations may use either.
         levels: strengths to sample, each with equal probability.
     """
 
     draws: ClassVar[tuple[type[Perturbation], ...]]
     colour: ClassVar[str] = "#a3384d"
     dimension: ClassVar[str] = ""
+    test_name: ClassVar[str] = ""
+    test_scene: ClassVar[TestScene] = "libero"
     audited: ClassVar[Literal["instructions", "cameras", "nothing"]] = "nothing"
     not_held_out: ClassVar[str] = ""
+    former_fields: ClassVar[Mapping[str, str]] = {}
 
     levels: Annotated[tuple[Level, ...], Field(min_length=1)] = LEVELS
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rename_former_fields(cls, raw: Any) -> Any:
+        """Give fields with a former name their name."""
+        if not isinstance(raw, Mapping):
+            return raw
+        for former, name in cls.former_fields.items():
+            if former in raw and name in raw:
+                raise ValueError(f"{former} is the former name of {name}: give {name} alone")
+        return {cls.former_fields.get(name, name): value for name, value in raw.items()}
 
     def applies(self, task: Task) -> bool:
         """Return whether the axis can change ``task``; its episodes are spread over all tasks that it can change.
@@ -180,6 +216,11 @@ class Axis(Frozen):
     def entries(self, task: Task) -> Sequence[str]:
         """List the entries that the axis takes its perturbations of a task from; empty if it samples from ranges."""
         return ()
+
+    @property
+    def keeps_clearance(self) -> bool:
+        """Return whether perturbations keep their clearance to the test tasks."""
+        return True
 
     def refuse_tested(self, test: TestSet, task: Task) -> None:
         """Reject levels without any perturbation that keeps its clearance, as far as the ranges show this.
@@ -219,6 +260,43 @@ class Axis(Frozen):
     def offered(self) -> dict[str, int]:
         """Count the distinct third-party things to sample from, by kind; missing sources are fetched."""
         return {}
+
+    @classmethod
+    def name(cls) -> str:
+        """Return the name of the axis, which all its perturbations have."""
+        return str(cls.draws[0].model_fields["axis"].default)
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the perturbations of kept episodes, next to the test tasks.
+
+        The default has the level and every parameter that is a number.
+        """
+        parameters = []
+        for parameter, field in cls.draws[0].model_fields.items():
+            if field.annotation in (int, float) and all(parameter in kind.model_fields for kind in cls.draws):
+                parameters.append(parameter)
+        plots: list[Plot] = []
+        for parameter in ("level", *parameters):
+            values = np.array([getattr(item.perturbation, parameter) for item in kept], float)
+            plots.append(Strips(parameter.replace("_", " "), {"draws": {cls.name(): values}}, parameter))
+        return CoveragePlots(f"{len(test.on_axis(cls.name())):,} test tasks.", plots)
+
+    @classmethod
+    def observe_tests(cls, test: TestSet) -> Measures:
+        """Measure what a policy sees of the axis in the test tasks, under the names of ``Perturbation.observe``.
+
+        Measures that need a simulator are not computed here: ``benchmarks/test_tasks_seen.py`` has stored them.
+        """
+        return ()
+
+    @classmethod
+    def observe_together(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> Measures:
+        """Measure the axis's perturbations of all kept episodes together, also of episodes with several changes.
+
+        The items of ``kept`` have no ``resolved``.
+        """
+        return ()
 
 
 class TextPerturbation(Perturbation):
@@ -271,6 +349,7 @@ class RenderPerturbation(Perturbation):
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
+    can_hide: ClassVar[bool] = True
     fields: ClassVar[tuple[str, ...]] = ()
     casts_shadows: ClassVar[bool]
     paints: ClassVar[bool]

@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from itertools import chain
+from operator import attrgetter
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
+from pipeline import seeding
 from pipeline.axes.base import (
     Axis,
     ByLevel,
     Degrees,
     Frozen,
     Intervals,
+    Level,
     RenderPerturbation,
     draw,
     level_from,
     pick,
     point,
 )
+from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation, Scatter, Strips
+from pipeline.errors import PipelineError
 from pipeline.rotations import about, product, rotate
-from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.testset.benchmark import TESTED_SUITES, TestSet, TestTask
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -106,7 +112,12 @@ class CameraPerturbation(RenderPerturbation):
         camera.pos[:], camera.quat[:] = self.pose(camera.pos.copy(), camera.quat.copy())
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """Return the distances (N,) to the test cameras of all tasks, because many tasks share one nominal view."""
+        """Return the distances (N,) to the test cameras of all tasks, because many tasks share one nominal view.
+
+        They are NaN for a task of a suite without test tasks: LIBERO-90's and the user's own.
+        """
+        if task.suite not in TESTED_SUITES:
+            return np.full(len(test.on_axis(self.axis)), np.nan)
         cameras, places = _test_cameras(test)
         return self._angles_deg(cameras)[places]
 
@@ -257,12 +268,37 @@ ASIDES: dict[Component, tuple[Aside, ...]] = {
 }
 """Kinds of second change of each component's perturbations, each with equal probability."""
 
+COMPONENT_OF: dict[Aside, Component] = {
+    "elevation": "spherical",
+    "distance": "distance",
+    "turn": "orientation",
+    "yaw": "orientation",
+}
+"""Component whose configured ranges a kind of second change keeps."""
+
+ClearBy = Literal["second_change", "resample", "off"]
+
+SECOND_CHANGES = 20
+"""Most attempts to sample a second change within the configured ranges."""
+
+TRIED_CAMERAS = 300
+"""Number of cameras of a component and level of which at least one has to keep its clearance."""
+
 
 class CameraAxis(Axis):
     """The ranges to draw from: each component spans what LIBERO-Plus's test cameras of its kind do.
 
     There every value is taken, so a draw changes something else as well, which keeps it 5 degrees from all of them:
     a distance of 1.6 with 6 degrees of elevation is clear. What the defaults show was looked at in all five arenas.
+
+    Attributes:
+        components: which of them, each as often as the others.
+        clear_by: what keeps the cameras of the four tested suites at their clearance from the test cameras. No value
+            leaves a configured range, and cameras of other suites have no test cameras to keep away from.
+            ``second_change`` changes another one of ``components`` as well, within its ranges. ``resample`` only
+            samples again, which needs ranges that the test cameras leave free. ``off`` keeps no clearance:
+            ``leakage.json`` counts the overlaps, and the run goes on.
+        aside: ranges of the second change, as far as they are in the ranges of its component.
     """
 
     draws: ClassVar = (CameraPerturbation,)
@@ -270,17 +306,26 @@ class CameraAxis(Axis):
     dimension: ClassVar = "camera"
     audited: ClassVar = "cameras"
 
-    distance: DistanceRange | None = DistanceRange()
-    spherical: SphericalRange | None = SphericalRange()
-    orientation: OrientationRange | None = OrientationRange()
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = get_args(Component)
+    distance: DistanceRange = DistanceRange()
+    spherical: SphericalRange = SphericalRange()
+    orientation: OrientationRange = OrientationRange()
+    clear_by: ClearBy = "second_change"
     aside: AsideRange = AsideRange()
 
-    @model_validator(mode="after")
-    def _some_component(self) -> CameraAxis:
-        """Check that at least one component is left."""
-        if not (self.distance or self.spherical or self.orientation):
+    @model_validator(mode="before")
+    @classmethod
+    def _leave_out_null(cls, raw: Any) -> Any:
+        """Leave out components whose ranges are null, as configurations did before ``components``."""
+        if not isinstance(raw, Mapping):
+            return raw
+        null = [name for name in get_args(Component) if name in raw and raw[name] is None]
+        if not null:
+            return raw
+        left = [name for name in raw.get("components", get_args(Component)) if name not in null]
+        if not left:
             raise ValueError("leave at least one of distance, spherical and orientation")
-        return self
+        return {name: ranges for name, ranges in raw.items() if name not in null} | {"components": left}
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
@@ -294,23 +339,116 @@ class CameraAxis(Axis):
             case _:
                 return level_from(max(abs(value["yaw_deg"]), abs(value["pitch_deg"])) / 2)
 
+    @property
+    def keeps_clearance(self) -> bool:
+        """Return whether cameras keep their clearance to the test cameras."""
+        return self.clear_by != "off"
+
+    def refuse_tested(self, test: TestSet, task: Task) -> None:
+        """Reject a component with a level at which the ranges have no camera at its clearance from the test cameras.
+
+        Raises:
+            PipelineError: naming component and levels.
+        """
+        if not self.keeps_clearance:
+            return
+        for component in dict.fromkeys(self.components):
+            near = [level for level in sorted({*self.levels}) if not self._has_clear(component, level, test, task)]
+            if near:
+                raise PipelineError(
+                    f"no {component} camera of level {', '.join(map(str, near))} within the ranges is at least "
+                    f"{CameraPerturbation.clearance:g} degrees from all test cameras",
+                    where="plan.axes.camera",
+                    expected="components that can change together with it, with ranges that reach 5 degrees",
+                    remedy="name more components or wider ranges; or clear_by: off, which lets training cameras equal "
+                    "test cameras",
+                )
+
+    def _has_clear(self, component: Component, level: Level, test: TestSet, task: Task) -> bool:
+        """Return whether one of ``TRIED_CAMERAS`` of a component and level keeps its clearance."""
+        random = seeding.rng("clear cameras", component, level)
+        for _ in range(TRIED_CAMERAS):
+            perturbation = self._draw(random, component, level, task)
+            if perturbation.nearest(test, task).distance >= perturbation.clearance:
+                return True
+        return False
+
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        components = (self.distance, self.spherical, self.orientation)
-        chosen = pick(rng, [ranges for ranges in components if ranges is not None])
-        level = self.draw_level(rng)
-        component: Component
-        match chosen:
-            case DistanceRange():
-                component = "distance"
-                drawn = {"distance_scale": draw(rng, chosen.distance_scale[level - 1])}
-            case SphericalRange():
-                component = "spherical"
-                azimuth_deg = draw(rng, chosen.azimuth_deg[level - 1])
-                drawn = {"azimuth_deg": azimuth_deg, "elevation_deg": draw(rng, chosen.elevation_deg)}
-            case OrientationRange():
-                component = "orientation"
-                large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
-                turn_deg = draw(rng, chosen.turn_deg[level - 1])
-                drawn = {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
-        drawn |= self.aside.draw(rng, pick(rng, ASIDES[component]))
+        component = pick(rng, self.components)
+        return self._draw(rng, component, self.draw_level(rng), task)
+
+    def _draw(self, rng: np.random.Generator, component: Component, level: Level, task: Task) -> CameraPerturbation:
+        """Sample a perturbation of a component at a level."""
+        drawn = self._draw_parameters(rng, component, level)
+        if self.clear_by == "second_change" and task.suite in TESTED_SUITES:
+            drawn |= self._draw_second_change(rng, component)
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
+
+    def _draw_second_change(self, rng: np.random.Generator, component: Component) -> dict[str, float]:
+        """Sample a second change within the configured ranges; empty if none is found.
+
+        A camera without one is rarely clear, and then sampled again.
+        """
+        kinds = [kind for kind in ASIDES[component] if COMPONENT_OF[kind] in self.components]
+        if not kinds:
+            return {}
+        kind = pick(rng, kinds)
+        intervals = self._intervals(COMPONENT_OF[kind])
+        for _ in range(SECOND_CHANGES):
+            change = self.aside.draw(rng, kind)
+            value = max(change.values(), key=abs)
+            if any(low <= value <= high for low, high in intervals):
+                return change
+        return {}
+
+    def _intervals(self, component: Component) -> tuple[tuple[float, float], ...]:
+        """List the intervals of a component, of all levels, that a second change keeps."""
+        match component:
+            case "distance":
+                return tuple(chain(*self.distance.distance_scale))
+            case "spherical":
+                return self.spherical.elevation_deg
+            case "orientation":
+                return tuple(chain(*self.orientation.turn_deg))
+
+    def _draw_parameters(self, rng: np.random.Generator, component: Component, level: Level) -> dict[str, float]:
+        """Sample the parameters that a component changes."""
+        match component:
+            case "distance":
+                return {"distance_scale": draw(rng, self.distance.distance_scale[level - 1])}
+            case "spherical":
+                azimuth_deg = draw(rng, self.spherical.azimuth_deg[level - 1])
+                return {"azimuth_deg": azimuth_deg, "elevation_deg": draw(rng, self.spherical.elevation_deg)}
+            case "orientation":
+                large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
+                turn_deg = draw(rng, self.orientation.turn_deg[level - 1])
+                return {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[CameraPerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the cameras' places, distances and turns."""
+        tested = [task.parameters for task in test.on_axis("camera")]
+        cameras = [item.perturbation for item in kept]
+
+        def points(first: str, second: str) -> dict[str, Floats]:
+            """Return distinct points (N, 2) of the test tasks, many of which share a camera, and the perturbations'."""
+            test_points = [(float(parameters[first]), float(parameters[second])) for parameters in tested]
+            read = attrgetter(first, second)
+            return {
+                BENCHMARK: np.unique(np.array(test_points).reshape(-1, 2), axis=0),
+                "camera": np.array([read(camera) for camera in cameras]).reshape(-1, 2),
+            }
+
+        scales = {
+            BENCHMARK: np.unique([float(parameters["distance_scale"]) for parameters in tested]),
+            "camera": np.array([camera.distance_scale for camera in cameras]),
+        }
+        return CoveragePlots(
+            f"{len(tested):,} test cameras. A draw is a point in each plot; what it leaves alone stays LIBERO's. Where "
+            "it lies on a test camera in one plot, it is apart from it in another.",
+            [
+                Scatter("where it stands", points("azimuth_deg", "elevation_deg"), "azimuth (°)", "elevation (°)"),
+                Strips("how far away", {"scale": scales}, "multiple of the distance"),
+                Scatter("how it is turned in place", points("yaw_deg", "pitch_deg"), "yaw (°)", "pitch (°)"),
+            ],
+        )

@@ -16,7 +16,7 @@ from pipeline.axes.base import Frozen
 from pipeline.jit import compiled
 from pipeline.types import Floats, Frame
 
-Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
+Component = Literal["motion", "gaussian_blur", "zoom", "fog", "glass"]
 SigmaPx = Annotated[float, Field(ge=0.1, le=100.0)]
 """Standard deviation of a Gaussian. Smaller values change nothing, larger ones give a whole frame one colour."""
 Pixels = NDArray[np.float32]
@@ -67,7 +67,7 @@ class Motion(Frozen):
 class Gaussian(Frozen):
     """Defocus as a Gaussian blur; scikit-image's ``gaussian`` with its defaults."""
 
-    component: ClassVar[Component] = "gaussian"
+    component: ClassVar[Component] = "gaussian_blur"
     strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
     sigma_px: SigmaPx
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Annotated, ClassVar, Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Intervals, PhysicsPerturbation, pick
+from pipeline.axes.report_data import ObservedEpisode
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import kept_actions
@@ -76,7 +77,7 @@ class DisturbancePerturbation(PhysicsPerturbation):
         ``push_at_grasp``: the gripper opens or closes within ``away_steps`` of the push.
         ``push_after_end``: the actions end within ``away_steps`` of the push, or before.
         """
-        gripper, end = actions[:, 6], self.first_step + self.steps
+        gripper, end = actions[:, 6], self.acts_until
         if end + self.away_steps > len(gripper):
             return "push_after_end"
         near = gripper[max(self.first_step - self.away_steps - 1, 0) : end + self.away_steps]
@@ -91,6 +92,17 @@ class DisturbancePerturbation(PhysicsPerturbation):
         """Return the distances (N,) to pushes that begin at the same step; NaN for pushes at another step."""
         apart_n_s = [float(np.linalg.norm(self.impulse_n_s - push.impulse_n_s)) for push in others]
         return np.where([self.first_step == push.first_step for push in others], apart_n_s, math.nan)
+
+    @property
+    def acts_until(self) -> int:
+        """Control step after the last step of the push."""
+        return self.first_step + self.steps
+
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure how far the push takes the hand off its path."""
+        look, twin = episode.look(self.acts_until), episode.twin_look(self.acts_until)
+        if twin is not None:
+            yield f"hand off its path after a push of level {self.level} (cm)", look.moved_cm(twin)
 
 
 class DisturbanceAxis(Axis):

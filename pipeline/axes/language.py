@@ -11,7 +11,7 @@ goal as far as ``language_goal.py`` can check.
 from __future__ import annotations
 
 import bisect
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
@@ -25,6 +25,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pipeline import seeding
 from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
 from pipeline.axes.language_lint import CLASSES, LENGTH, NAMED, REMEDY, Component, lint, normalise
+from pipeline.axes.report_data import BENCHMARK, CoveragePlots, Histogram, KeptPerturbation, ObservedEpisode, Strips
 from pipeline.errors import PipelineError
 from pipeline.jit import compiled
 from pipeline.libero.tasks import Same, find_task
@@ -68,12 +69,16 @@ class LanguagePerturbation(TextPerturbation):
             return nearest._replace(distance=0.0)
         return nearest
 
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Count the words of the instruction."""
+        yield "words", len(episode.instruction.split())
+
 
 class LanguageAxis(Axis):
     """Draws rewrites from the bank: all those of the chosen levels, none more often than another.
 
     Attributes:
-        classes: the classes drawn from.
+        components: the classes drawn from.
         bank: a further bank, such as the command ``rewrite`` makes; its rewrites join those that are shipped.
     """
 
@@ -83,7 +88,9 @@ class LanguageAxis(Axis):
     audited: ClassVar = "instructions"
     not_held_out: ClassVar[str] = "its rewrites are a list, and plans train on all of it"
 
-    classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
+    former_fields: ClassVar[Mapping[str, str]] = {"classes": "components"}
+
+    components: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
     bank: Place | None = None
 
     def beside(self, axes: Collection[str]) -> LanguageAxis:
@@ -92,18 +99,18 @@ class LanguageAxis(Axis):
         Names stay unambiguous then, because the scene has no objects of the added categories.
 
         Raises:
-            ValueError: when none of ``classes`` is left.
+            ValueError: when none of ``components`` is left.
         """
-        classes = self._classes(axes)
-        if not classes:
-            raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")
-        return self.model_copy(update={"classes": classes})
+        components = self._components_beside(axes)
+        if not components:
+            raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.components")
+        return self.model_copy(update={"components": components})
 
-    def _classes(self, axes: Collection[str]) -> tuple[Component, ...]:
-        """Return the classes to sample if episodes are perturbed on all of ``axes`` together."""
+    def _components_beside(self, axes: Collection[str]) -> tuple[Component, ...]:
+        """Return the components to sample if episodes are perturbed on all of ``axes`` together."""
         if "layout" not in axes:
-            return self.classes
-        return tuple(component for component in self.classes if component in NAMED)
+            return self.components
+        return tuple(component for component in self.components if component in NAMED)
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
@@ -116,7 +123,7 @@ class LanguageAxis(Axis):
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
-        return tuple(rewrite.text for rewrite in deal(task, self.classes, self.levels, self.bank))
+        return tuple(rewrite.text for rewrite in deal(task, self.components, self.levels, self.bank))
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
         """Return the rewrite at ``place`` of the task's list, which starts again at its end.
@@ -126,7 +133,7 @@ class LanguageAxis(Axis):
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
-        rewrites = deal(task, self.classes, self.levels, self.bank)
+        rewrites = deal(task, self.components, self.levels, self.bank)
         return rewrites[place % len(rewrites)]
 
     def wordings(self, task: Task, axes: Collection[str], test: TestSet) -> tuple[str, ...]:
@@ -138,10 +145,39 @@ class LanguageAxis(Axis):
             PipelineError: when one of the rewrites does not pass ``lint``.
         """
         texts = []
-        for rewrite in _dealt(task, self._classes(axes), self.levels, self.bank):
+        for rewrite in _dealt(task, self._components_beside(axes), self.levels, self.bank):
             if rewrite.nearest(test, task).distance >= rewrite.clearance:
                 texts.append(rewrite.text)
         return tuple(texts)
+
+    @classmethod
+    def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:
+        """Count the words of each test instruction."""
+        for tested in test.on_axis("language"):
+            yield "words", len(str(tested.parameters["text"]).split())
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[LanguagePerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the distances to the original wordings."""
+        tested = test.on_axis("language")
+        tested_shares = []
+        for task in tested:
+            original = find_task(task.suite, task.base).instruction
+            tested_shares.append(distance(str(task.parameters["text"]), original))
+        shares = [distance(item.perturbation.text, item.task.instruction) for item in kept]
+        rows = {}
+        for name in CLASSES:
+            of_class = [share for share, item in zip(shares, kept, strict=True) if item.perturbation.component == name]
+            rows[name.replace("_", " ")] = {"language": np.array(of_class)}
+        every = {BENCHMARK: np.array(tested_shares), "language": np.array(shares)}
+        label = "share of characters edited"
+        return CoveragePlots(
+            f"{len(tested):,} test instructions, of no stated class. The distance is the share of characters to edit.",
+            [
+                Histogram("distance to the original wording", every, np.linspace(0, 1, 21), label),
+                Strips("the same by class", rows, label),
+            ],
+        )
 
 
 @cache

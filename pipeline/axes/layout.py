@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field
 
 from pipeline.axes.base import Axis, Credit, Frozen, PhysicsPerturbation
+from pipeline.axes.report_data import BENCHMARK, CoveragePlots, Histogram, KeptPerturbation, ObservedEpisode, Scatter
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, nouns_of, taken, words_in
 from pipeline.errors import PipelineError
+from pipeline.libero import bddl
+from pipeline.libero.arenas import ARENAS, SURFACES, Arena
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 SHELF = 13
 """Number of models that the objects of one scene are sampled from, as in LIBERO-Plus."""
+
+CAMERA_SIDE_M = 0.19
+"""Least x, in the frame of the working surface, at which an object stands on the side of the agent camera."""
 
 
 class AddedObject(Frozen):
@@ -57,6 +63,7 @@ class LayoutPerturbation(PhysicsPerturbation):
 
     measure: ClassVar[str] = "infinite where no category is shared with a test task in the same scene, else 0"
     clearance: ClassVar[float] = 1.0
+    can_hide: ClassVar[bool] = True
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """Return the scene with the objects added; see ``pipeline.scenes.placement.place``."""
@@ -98,6 +105,15 @@ class LayoutPerturbation(PhysicsPerturbation):
         """List the added objects with their licences."""
         return frozenset(Credit(o.name, "object", o.licence, o.attribution) for o in self.objects)
 
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure the number of added objects and their places."""
+        model, placed = episode.model, episode.resolved["layout"]["objects"]
+        bodies = [model.body(body).name for body in range(model.nbody)]
+        surface_m = model.body(next(name for name in SURFACES if name in bodies)).pos
+        xy_m = np.array([thing["position_m"][:2] for thing in placed]) - surface_m[:2]
+        arena = bddl.read(episode.task.bddl_file).arena
+        return _measures([added.name for added in self.objects], xy_m, arena)
+
 
 class LayoutAxis(Axis):
     """Number and sources of added objects.
@@ -117,6 +133,8 @@ class LayoutAxis(Axis):
     draws: ClassVar = (LayoutPerturbation,)
     colour: ClassVar = "#7d9a1f"
     dimension: ClassVar = "layout"
+    test_name: ClassVar = "confounding objects"
+    test_scene: ClassVar = "bddl and models"
 
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
     area_m2: float = Field(default=0.12, gt=0.0, le=10.0)
@@ -150,6 +168,59 @@ class LayoutAxis(Axis):
         hashes = {model.sha256 for model in listed}
         categories = {model.category for model in listed}
         return {"models": len(hashes), "categories": len(categories)}
+
+    @classmethod
+    def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:
+        """Measure the number of added objects and their places in each test task."""
+        for tested in test.on_axis("layout"):
+            parameters = tested.parameters
+            models = str(parameters["category"]).split(",")
+            yield from _measures(models, _test_places_m(tested), cast(Arena, parameters["arena"]))
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[LayoutPerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the places and the number of the added objects."""
+        tested = test.on_axis("layout")
+        tested_at = np.array([place for task in tested for place in _test_places_m(task)])
+        placed_at = []
+        for item in kept:
+            room = ARENAS[bddl.read(item.task.bddl_file).arena]
+            placed = item.resolved["objects"] if item.resolved else ()
+            placed_at += [np.array(thing["position_m"][:2]) - [room.surface_x_m, 0.0] for thing in placed]
+        categories: set[str] = set()
+        for item in kept:
+            categories |= item.perturbation._categories
+        places = {BENCHMARK: np.unique(tested_at.reshape(-1, 2), axis=0), "layout": np.array(placed_at)}
+        number = {
+            BENCHMARK: np.array([float(task.parameters["count"]) for task in tested]),
+            "layout": np.array([len(item.perturbation.objects) for item in kept], float),
+        }
+        return CoveragePlots(
+            f"{len(tested):,} test tasks. Objects of {len(categories)} categories were added; a run stops where a test "
+            "task in the same scene adds one of these.",
+            [
+                Scatter("where objects stand", places, "x from the surface's centre (m)", "y (m)", equal=True),
+                Histogram("objects added", number, np.arange(0.5, 7.0), "objects"),
+            ],
+        )
+
+
+def _test_places_m(tested: TestTask) -> Floats:
+    """Return the places (N, 2) of the objects that a test task adds, in the frame of the working surface."""
+    pairs = str(tested.parameters["positions"]).split(";")
+    return np.array([pair.split(",") for pair in pairs if pair], float).reshape(-1, 2)
+
+
+def _measures(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:
+    """Measure a scene with added objects, by their models and their places (N, 2) in the frame of the surface."""
+    for number in range(1, 6):
+        yield f"scenes with {number} added", len(models) == number
+    if len(models) > 1:
+        yield f"scenes with {len(models)} added that repeat a model", len(set(models)) < len(models)
+    x_m, z_m = ARENAS[arena].camera_xz_m
+    for place in xy_m:
+        yield "object on the camera's side", bool(place[0] > CAMERA_SIDE_M)
+        yield "object to camera (m)", float(np.hypot(np.linalg.norm(place - [x_m, 0.0]), z_m))
 
 
 @cache

@@ -8,6 +8,7 @@ makes a frame black. docs/axes.md states the known and the unknown properties of
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
 
 import numpy as np
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
 from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, Level, RenderPerturbation, Share, draw
+from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Strips
 from pipeline.libero import bddl
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Frame, Task
 
 if TYPE_CHECKING:
@@ -155,6 +158,7 @@ class LightAxis(Axis):
     draws: ClassVar = (LightPerturbation,)
     colour: ClassVar = "#e59a00"
     dimension: ClassVar = "light"
+    test_scene: ClassVar = "scene files"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = get_args(Component)
     combined_share: float = Field(default=0.6, ge=0.0, le=1.0)
@@ -210,6 +214,23 @@ class LightAxis(Axis):
                 return {"tilt_deg": draw(rng, ranges.tilt_deg), "tilt_azimuth_deg": draw(rng, TILT_AZIMUTH_DEG)}
             case _:
                 return {"shadows": True, "fill_scale": draw(rng, ranges.fill_scale)}
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[LightPerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe plots of brightness, tint, gloss and direction."""
+        lights = [item.perturbation for item in kept]
+        columns = {
+            "brightness": ("multiple of the diffuse light", [float(np.mean(p.diffuse_scale_rgb)) for p in lights]),
+            "tint": ("saturation", [1 - min(p.diffuse_scale_rgb) / max(*p.diffuse_scale_rgb, 1e-9) for p in lights]),
+            "gloss": ("multiple of the specular light", [p.specular_scale for p in lights]),
+            "direction": ("lamps tilted by (°)", [p.tilt_deg for p in lights]),
+        }
+        return CoveragePlots(
+            f"{len(test.on_axis('light')):,} test tasks, whose values are unknown offline: they are published only "
+            f"within the benchmark's asset archive. {sum(p.shadows for p in lights)} of {len(lights)} draws cast "
+            "shadows.",
+            [Strips(name, {"draws": {"light": np.array(own)}}, label) for name, (label, own) in columns.items()],
+        )
 
 
 def exposure(frame: Frame) -> str | None:

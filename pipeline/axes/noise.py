@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from pipeline import seeding
 from pipeline.axes.base import LEVELS, Axis, ByLevel, PixelPerturbation, level_from, pick
+from pipeline.axes.component_names import current_names, stored_names
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
+from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation, ObservedEpisode, Strips
 from pipeline.errors import PipelineError
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -30,13 +32,14 @@ class NoisePerturbation(PixelPerturbation):
     """One corruption at one strength for a whole episode.
 
     Attributes:
+        component: name of the effect; the blur by a Gaussian is stored under its former name, ``gaussian``.
         effect: the corruption and its parameters.
         level: row of ``effect`` in the axis's grid.
         seed: with the index of the frame, the key of all random numbers in :meth:`apply`.
     """
 
     axis: Literal["noise"] = "noise"
-    component: Component
+    component: Annotated[Component, BeforeValidator(current_names), PlainSerializer(stored_names)]
     effect: Effect
     seed: int
 
@@ -83,6 +86,12 @@ class NoisePerturbation(PixelPerturbation):
             severities.append(perturbation.severity(test) if comparable else np.nan)
         return np.abs(np.array(severities) - self.severity(test))
 
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure the mean change of the agent view."""
+        changes = episode.changes()
+        if changes:
+            yield f"{self.component} (mean grey levels)", float(changes["image"].mean())
+
     def severity(self, test: TestSet) -> float:
         """Return the strength on the scale of the component's test severities.
 
@@ -121,14 +130,23 @@ def _grid(effect: type[E], **parameters: ByLevel[float]) -> ByLevel[E]:
 
 
 class NoiseAxis(Axis):
-    """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none."""
+    """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none.
+
+    Attributes:
+        components: which of them, each as often as the others.
+    """
 
     draws: ClassVar = (NoisePerturbation,)
     colour: ClassVar = "#9467d6"
     dimension: ClassVar = "noise"
 
+    former_fields: ClassVar[Mapping[str, str]] = {"gaussian": "gaussian_blur"}
+
+    components: Annotated[tuple[Annotated[Component, BeforeValidator(current_names)], ...], Field(min_length=1)] = (
+        get_args(Component)
+    )
     motion: ByLevel[Motion] = _grid(Motion, radius_px=(7, 11, 17, 23, 33), sigma_px=(2.5, 4.5, 7, 11, 17.5))
-    gaussian: ByLevel[Gaussian] = _grid(Gaussian, sigma_px=(1.5, 3.5, 5.5, 7.5, 9.5))
+    gaussian_blur: ByLevel[Gaussian] = _grid(Gaussian, sigma_px=(1.5, 3.5, 5.5, 7.5, 9.5))
     zoom: ByLevel[Zoom] = _grid(Zoom, max_scale=(1.13, 1.22, 1.33, 1.42, 1.52), copies=(14, 12, 23, 22, 27))
     fog: ByLevel[Fog] = _grid(Fog, density=(0.75, 1.75, 2.75, 3.75, 4.75), roughness_decay=(2.9, 2.35, 1.9, 1.55, 1.35))
     glass: ByLevel[Glass] = _grid(
@@ -142,16 +160,22 @@ class NoiseAxis(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
         """Sample a component and a level, each with equal probability, independent of ``task`` and ``place``."""
-        grid = pick(rng, self._grids)
+        grid = self._grids[pick(rng, self.components)]
         level = self.draw_level(rng)
         effect = grid[level - 1]
         seed = int(rng.integers(2**53))  # every JSON reader keeps such an integer exactly
         return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=seed)
 
     @property
-    def _grids(self) -> tuple[ByLevel[Effect], ...]:
-        """Grids of all components."""
-        return self.motion, self.gaussian, self.zoom, self.fog, self.glass
+    def _grids(self) -> dict[Component, ByLevel[Effect]]:
+        """Grid of each component."""
+        return {
+            "motion": self.motion,
+            "gaussian_blur": self.gaussian_blur,
+            "zoom": self.zoom,
+            "fog": self.fog,
+            "glass": self.glass,
+        }
 
     def refuse_tested(self, test: TestSet, task: Task) -> None:
         """Reject a row that is too near to a severity of the benchmark, because its level has no other perturbation.
@@ -159,7 +183,8 @@ class NoiseAxis(Axis):
         Raises:
             PipelineError: naming component and levels.
         """
-        for grid in self._grids:
+        for component in dict.fromkeys(self.components):
+            grid = self._grids[component]
             near = []
             for level in sorted({*self.levels}):
                 effect = grid[level - 1]
@@ -167,7 +192,7 @@ class NoiseAxis(Axis):
                 if row.nearest(test, task).distance < row.clearance:
                     near.append(level)
             if near:
-                component, (name, _) = grid[0].component, grid[0].strength
+                name, _ = grid[0].strength
                 tested = ", ".join(f"{value:g}" for value in _tested(test, component, name)[0])
                 raise PipelineError(
                     f"{component} has test tasks as strong as the level {', '.join(map(str, near))}",
@@ -189,6 +214,27 @@ class NoiseAxis(Axis):
         for component in dict.fromkeys(test.component for test in tests):
             grids[component] = tuple(effects[component, 2 * level] for level in LEVELS)
         return cls.model_validate(grids)
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[NoisePerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe a plot of the strengths of each component, on the scale of the benchmark's severities."""
+        rows = {}
+        for component in dict.fromkeys(task.component for task in test.on_axis("noise")):
+            of_component = [item.perturbation for item in kept if item.perturbation.component == component]
+            tested = [task.parameters for task in test.on_axis("noise") if task.component == component]
+            severities: Floats = np.unique([float(parameters["severity"]) for parameters in tested])
+            at = np.array([])
+            if of_component:
+                name, clean = of_component[0].effect.strength
+                ladder = sorted({(float(parameters["severity"]), float(parameters[name])) for parameters in tested})
+                steps, values = np.array([(0.0, float(clean)), *ladder]).T
+                at = np.interp([float(getattr(p.effect, name)) for p in of_component], values, steps)
+            rows[component.replace("_", " ")] = {BENCHMARK: severities, "noise": at}
+        return CoveragePlots(
+            f"{len(test.on_axis('noise')):,} test tasks at ten severities of each kind; a draw stands where its "
+            "strength would, on the benchmark's scale.",
+            [Strips("strength by kind", rows, "severity")],
+        )
 
 
 def effect_of(test: TestTask) -> dict[str, Value]:

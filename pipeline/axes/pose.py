@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import combinations
 from typing import Annotated, ClassVar, Literal, Self
@@ -17,6 +18,16 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from pipeline.axes.base import Axis, Frozen, Level, Perturbation, PhysicsPerturbation, pick, point
+from pipeline.axes.report_data import (
+    BENCHMARK,
+    CoveragePlots,
+    KeptPerturbation,
+    Measures,
+    ObservedEpisode,
+    Plot,
+    Scatter,
+    Strips,
+)
 from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
 from pipeline.libero.task_goal import relation_holds
@@ -58,6 +69,9 @@ DRAWS = 200
 
 Shifts = dict[str, tuple[float, float]]
 """Name of a thing to its displacement (dx, dy) in m."""
+
+_Places = dict[Task, list[tuple[str, Shifts]]]
+"""LIBERO task to the displacements of its test tasks, by their names, or of a run's episodes, without names."""
 
 
 class Move(Frozen):
@@ -248,6 +262,10 @@ class ScenePerturbation(_PosePerturbation):
         shifts_of_others = [perturbation.shifts_in_all for perturbation in others]
         return self._apart_m(lambda name: [shifts.get(name, NOWHERE) for shifts in shifts_of_others])
 
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure how far the objects are moved that the task moves."""
+        return _targets_moved(episode.task, self.shifts_in_all, self.level)
+
     @property
     def shifts(self) -> Shifts:
         """Displacement of each thing from its place in the demonstration."""
@@ -350,6 +368,8 @@ class PoseAxis(Axis):
     draws: ClassVar = (PosePerturbation, ScenePerturbation)
     colour: ClassVar = "#d463b0"
     dimension: ClassVar = "layout"
+    test_name: ClassVar = "displaced targets"
+    test_scene: ClassVar = "bddl"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("scene",)
     step_m: float = Field(default=0.016, ge=0.0001, le=0.2)
@@ -386,3 +406,85 @@ class PoseAxis(Axis):
         dx_m, dy_m = point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
         turn_deg = round(rng.uniform(-self.turn_deg, self.turn_deg), 2)
         return PosePerturbation(level=level, component=component, moved=moved, dx_m=dx_m, dy_m=dy_m, dyaw_deg=turn_deg)
+
+    @classmethod
+    def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:
+        """Measure how far each test task moves its targets, and how far it is from the nearest other test task."""
+        places: _Places = defaultdict(list)
+        for tested in test.on_axis("pose"):
+            task = find_task(tested.suite, tested.base)
+            shifts = displacements(tested.parameters)
+            yield from _targets_moved(task, shifts, cls.level_of_test(tested))
+            places[task].append((tested.name, shifts))
+        yield from _to_nearest(test, places)
+
+    @classmethod
+    def observe_together(cls, kept: Sequence[KeptPerturbation[_PosePerturbation]], test: TestSet) -> Measures:
+        """Measure how far each test task is from the nearest of all episodes of its task.
+
+        Test tasks are left out for which no episode moves an object of interest.
+        """
+        places: _Places = defaultdict(list)
+        for item in kept:
+            places[item.task].append(("", item.perturbation.shifts_in_all))
+        return _to_nearest(test, places)
+
+    @classmethod
+    def describe_coverage(
+        cls, kept: Sequence[KeptPerturbation[PosePerturbation | ScenePerturbation]], test: TestSet
+    ) -> CoveragePlots:
+        """Describe plots of the displacements of one object, and of all things of a scene."""
+        tested = [task.parameters for task in test.on_axis("pose")]
+        targets = [(parameters["dx_m"], parameters["dy_m"]) for parameters in tested if "dx_m" in parameters]
+        alone, scenes = [], []
+        for item in kept:
+            if isinstance(item.perturbation, PosePerturbation):
+                alone.append(item.perturbation)
+            else:
+                scenes.append(item.perturbation)
+        plots: list[Plot] = []
+        if alone:
+            turns = {"yaw": {"pose": np.array([p.dyaw_deg for p in alone])}}
+            plots.append(_plot_shifts("where the moved object goes", targets, [(p.dx_m, p.dy_m) for p in alone]))
+            plots.append(Strips("how far it turns", turns, "degrees"))
+        if scenes or not alone:
+            moved: list[tuple[float, float]] = []
+            for parameters in tested:
+                moved += displacements(parameters).values()
+            shifts_m = [(move.dx_m, move.dy_m) for scene in scenes for move in scene.moves]
+            plots.append(_plot_shifts("where each thing of a scene goes", moved, shifts_m))
+        return CoveragePlots(
+            f"{len(tested):,} test tasks, of which {len(targets):,} move the target, and all of which move everything "
+            f"else as well. {len(scenes)} of {len(kept)} draws move the whole scene. Turns are this project's own.",
+            plots,
+        )
+
+
+def _plot_shifts(title: str, tested_m: Sequence[object], shifts_m: Sequence[object]) -> Scatter:
+    """Describe a plot of displacements (dx, dy) in m, of test tasks and of perturbations."""
+    groups = {
+        BENCHMARK: 100 * np.array(tested_m, float).reshape(-1, 2),
+        "pose": 100 * np.array(shifts_m, float).reshape(-1, 2),
+    }
+    return Scatter(title, groups, "dx (cm)", "dy (cm)", equal=True)
+
+
+def _targets_moved(task: Task, shifts: Shifts, level: int) -> Iterator[tuple[str, float]]:
+    """Measure the displacements of the objects that a task moves."""
+    for target in bddl.read(task.bddl_file).targets:
+        if target in shifts:
+            yield f"target of {task.suite} moved, level {level} (cm)", 100 * float(np.hypot(*shifts[target]))
+
+
+def _to_nearest(test: TestSet, places: _Places) -> Iterator[tuple[str, float]]:
+    """Measure how far the objects of interest of each test task are from their nearest places under other names."""
+    for tested in test.on_axis("pose"):
+        task = find_task(tested.suite, tested.base)
+        tested_shifts = displacements(tested.parameters)
+        others = [shifts for name, shifts in places[task] if name != tested.name]
+        for thing in bddl.read(task.bddl_file).things_of_interest:
+            if thing not in tested_shifts:
+                continue
+            apart_m = [math.dist(tested_shifts[thing], shifts[thing]) for shifts in others if thing in shifts]
+            if apart_m:
+                yield f"test's thing of interest in {task.suite} to the nearest other (cm)", 100 * min(apart_m)

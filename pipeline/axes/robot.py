@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, level_from, pick
+from pipeline.axes.report_data import (
+    BENCHMARK,
+    CoveragePlots,
+    Groups,
+    Histogram,
+    KeptPerturbation,
+    ObservedEpisode,
+    Strips,
+)
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import HOME_RAD
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
+
+if TYPE_CHECKING:
+    from pipeline.scenes.look import Look
 
 Joints = tuple[float, float, float, float, float, float, float]
 Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
@@ -108,6 +120,12 @@ class RobotPerturbation(PhysicsPerturbation):
             return Nearest(np.inf, compared)
         return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()), compared)
 
+    def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
+        """Measure how far the hand starts from the clean twin's."""
+        twin = episode.twin_look()
+        if twin is not None:
+            yield from measure_start(episode.look(), twin, self.component, self.level)
+
     def _apart_rad(self, offsets_rad: ArrayLike) -> Floats:
         """Return the distances (N,) to offsets (N, 7)."""
         return np.asarray(np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1))
@@ -123,6 +141,12 @@ def benchmark_offsets_rad() -> Floats:
     directions = np.random.RandomState(42).randn(500, 7)
     norms = np.repeat([0.1, 0.2, 0.3, 0.4, 0.5], 100)
     return np.asarray(directions * (norms / np.linalg.norm(directions, axis=1))[:, None])
+
+
+def measure_start(start: Look, twin: Look, component: str, level: int) -> Iterator[tuple[str, float]]:
+    """Measure how far the hand is moved and turned at the first look of an episode, next to its clean twin's."""
+    yield f"hand moved by {component}, level {level} (cm)", start.moved_cm(twin)
+    yield f"hand turned by {component}, level {level} (degrees)", start.turned_deg(twin)
 
 
 class RobotAxis(Axis):
@@ -159,4 +183,22 @@ class RobotAxis(Axis):
         offsets = direction * (norms_rad[level - 1] / np.linalg.norm(direction))
         return RobotPerturbation.model_validate(
             {"component": component, "level": level, "joint_offsets_rad": offsets.round(6).tolist()}
+        )
+
+    @classmethod
+    def describe_coverage(cls, kept: Sequence[KeptPerturbation[RobotPerturbation]], test: TestSet) -> CoveragePlots:
+        """Describe plots of the offsets' sizes, and of each joint's offsets."""
+        ids = [int(task.parameters["id"]) - 1 for task in test.on_axis("robot")]
+        tested = benchmark_offsets_rad()[ids].reshape(-1, 7)
+        offsets = np.array([item.perturbation.joint_offsets_rad for item in kept]).reshape(-1, 7)
+        joints: dict[str, Groups] = {}
+        for joint in range(7):
+            joints[f"joint {joint + 1}"] = {BENCHMARK: np.unique(tested[:, joint]), "robot": offsets[:, joint]}
+        norms = {BENCHMARK: np.linalg.norm(tested, axis=1), "robot": np.linalg.norm(offsets, axis=1)}
+        return CoveragePlots(
+            f"{len(ids):,} test tasks with {len(set(ids))} different offsets.",
+            [
+                Histogram("size of the offset", norms, np.arange(0.025, 0.6, 0.05), "norm (rad)"),
+                Strips("offset by joint, base to wrist", joints, "rad"),
+            ],
         )

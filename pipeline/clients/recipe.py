@@ -16,6 +16,8 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
+from pipeline.formats.rlds import Rlds
 from pipeline.formats.rlds_layout import dataset_of, split_of
 from pipeline.generated import generated
 
@@ -35,6 +37,18 @@ OPENPI = "pi05_libero"
 OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
 """Path of the statistics below the configuration's assets folder; the configuration reads it to serve a policy."""
 
+EXPORTS = {
+    "openvla_oft": "export: {rlds: {}}",
+    "lerobot_act": "export: {lerobot: {}}",
+    "lerobot_smolvla": "export: {lerobot: {}}",
+    "lerobot_pi05": "export: {lerobot: {}}",
+    "starvla": "export: {lerobot_v21: {convention: ipec}}",
+    "gr00t": "export: {lerobot_v21: {convention: ipec}}",
+    "openpi": "export: {lerobot_v21: {convention: openpi}}",
+    "openpi_serve": "export: {lerobot_v21: {convention: openpi}}",
+}
+"""Client to the setting of a run's configuration that exports the format that it reads."""
+
 MANIFEST = "manifest.parquet of this run"
 
 
@@ -51,6 +65,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
             every episode, its place in each format, and the versions and the device that generated it.
         export: the datasets that the run exports; its RLDS name is OpenVLA-OFT's name for all RLDS datasets.
     """
+    rlds, lerobot = export.options_for(Rlds), export.options_for(LeRobot)
     kept = [row for row in rows if row["kept"]]
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for row in kept:
@@ -62,30 +77,34 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
         "episodes_by_suite_and_axis": sourced({suite: dict(axes) for suite, axes in counts.items()}, MANIFEST),
     }
     oft_validates = False
-    if export.rlds is not None:
+    if rlds is not None:
         suites = {row["suite"]: dataset_of(row) for row in kept}
         dataset["suites"] = sourced(suites, MANIFEST + ": the RLDS dataset that holds each suite")
         validating = {dataset_of(row) for row in kept if split_of(Path(row["rlds_shard"])) == "val"}
         often = "about equally often, as the steps of val count too" if validating else "equally often"
         dataset["mixtures"] = sourced(
-            {export.rlds.name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
+            {rlds.name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
             f"OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn {often}",
         )
         # OFT requests the validation split from every dataset.
         oft_validates = bool(validating) and validating == {*suites.values()}
-    if export.lerobot is not None:
-        dataset["lerobot"] = sourced(export.lerobot.name, "the run's configuration, export.lerobot.name")
-    return {"name": (export.rlds or export).name, "dataset": dataset, **_training_and_clients(export, oft_validates)}
+    if lerobot is not None:
+        dataset["lerobot"] = sourced(lerobot.name, "the run's configuration, export.lerobot.name")
+    return {"name": (rlds or export).name, "dataset": dataset, **_training_and_clients(export, oft_validates)}
 
 
 def _training_and_clients(export: ExportConfig, oft_validates: bool) -> dict[str, Any]:
-    """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``."""
+    """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``.
+
+    Clients whose format is not exported are listed with the setting that exports it.
+    """
     cameras = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), 1)}
     values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
-    return sections
+    missing = {client: setting for client, setting in EXPORTS.items() if client not in sections["clients"]}
+    return {**sections, "clients_of_other_formats": missing} if missing else sections
 
 
 def _filled(template: str, **values: object) -> str:
@@ -110,26 +129,26 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
     Raises:
         PipelineError: if edits in ``finetune`` would be lost.
     """
-    wanted = export.lerobot_v21
+    lerobot, lerobot_v21 = export.options_for(LeRobot), export.options_for(LeRobotV21)
     with generated(folder) as unfinished:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / RECIPE).write_text(text)
-        if export.rlds is not None:
+        if export.options_for(Rlds) is not None:
             shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
-        if export.lerobot is not None and export.lerobot.validation:
-            info = read_json(datasets["lerobot"] / export.lerobot.name / "meta" / "info.json")
+        if lerobot is not None and lerobot.validation:
+            info = read_json(datasets["lerobot"] / lerobot.name / "meta" / "info.json")
             episodes = [*range(int(info["splits"]["train"].partition(":")[2]))]
             (unfinished / LEROBOT_TRAIN).write_text(json.dumps({"dataset": {"episodes": episodes}}) + "\n")
-        if wanted is not None and wanted.convention == "openpi":
-            table = pq.read_table(datasets["lerobot_v21"] / wanted.name / "data", columns=["actions", "state"])
+        if lerobot_v21 is not None and lerobot_v21.convention == "openpi":
+            table = pq.read_table(datasets["lerobot_v21"] / lerobot_v21.name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
             (unfinished / OPENPI_ASSETS).parent.mkdir(parents=True)
             content = json.dumps(exact_statistics.openpi(actions, states), indent=1) + "\n"
             (unfinished / OPENPI_ASSETS).write_text(content)
-        if wanted is not None and wanted.convention == "ipec":
+        if lerobot_v21 is not None and lerobot_v21.convention == "ipec":
             roots = sorted(path.name for path in datasets["lerobot_v21"].iterdir() if not path.name.endswith("_val"))
-            mixture = _filled("starvla_data_config.py.j2", name=wanted.name, roots=roots)
+            mixture = _filled("starvla_data_config.py.j2", name=lerobot_v21.name, roots=roots)
             (unfinished / "starvla_data_config.py").write_text(mixture)
 
 

@@ -1,5 +1,5 @@
-"""The command line, a file for each family of commands.
+"""The command line: a module for each group of commands.
 
-A command is a function, whose docstring is what ``--help`` says of it. What takes long to import it imports itself, and
-its arguments are added only when it is called: so ``--help`` of all is quick.
+A command is a function with click's decorators, and its docstring is the text of its ``--help``. A module is imported
+when one of its commands is called. Functions import what takes long, so that the help of a command appears at once.
 """

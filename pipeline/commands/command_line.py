@@ -1,48 +1,67 @@
-"""Command line of all commands, whose families are the other modules of this folder."""
+"""Command line: all commands by their groups; each is defined in another module of this folder."""
 
-import argparse
-import os
 import sys
 from pathlib import Path
 
-from pipeline.commands import before, demos, develop, evaluate, finished, runs
-from pipeline.commands.base import LazyParser
-from pipeline.exit_status import exit_status
+import click
 
-FAMILIES = (runs, demos, before, finished, evaluate, develop)
+from pipeline.commands.base import LazyGroup, Listed
 
 DESCRIPTION = """\
-Perturbed fine-tuning data from LIBERO demonstrations. A run is one configuration, a file of configs/: every command
-that is about a run takes it as its last argument, and else the one that params.yaml names.
+Generate perturbed fine-tuning data from LIBERO demonstrations.
+
+A run is one configuration, a file such as configs/starter.yaml. A command about a run takes its configuration as the
+last argument.
 """
 EXAMPLES = """\
-examples:
-  python -m pipeline run configs/starter.yaml                    about 47 episodes of eight axes, in minutes
-  python -m pipeline preview 'libero_goal/turn_on*' camera       what an axis does to a task
-  python -m pipeline demos fetch data/demos libero_goal          all 50 demonstrations of each task, from the hub
-  python -m pipeline COMMAND --help                              what a command takes
+\b
+Examples:
+  python -m pipeline run configs/starter.yaml                  about 47 episodes of eight axes, in minutes
+  python -m pipeline preview 'libero_goal/turn_on*' camera     an axis on a task, as a picture
+  python -m pipeline demos fetch data/demos libero_goal        all 50 demonstrations of each task, from the hub
+  python -m pipeline COMMAND --help                            arguments and options of a command
 """
+MOVED = {
+    "check": "dataset check",
+    "audit": "dataset audit",
+    "regenerate": "dataset regenerate",
+    "push": "dataset push",
+    "analyse": "analyze",
+}
 
-
-def parser() -> argparse.ArgumentParser:
-    installed = Path(sys.argv[0]).name == "perturbed-demos"
-    top = argparse.ArgumentParser(
-        prog="perturbed-demos" if installed else "python -m pipeline",
-        usage="%(prog)s COMMAND ...",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = top.add_subparsers(
-        required=True, metavar="COMMAND", help=argparse.SUPPRESS, parser_class=LazyParser, prog=top.prog
-    )
-    families = []
-    for family in FAMILIES:
-        others = set(commands.choices)
-        family.add_commands(commands)
-        lines = [f"  {name:<11} {one.summary}" for name, one in commands.choices.items() if name not in others]
-        families.append("\n".join([f"{family.TITLE}:", *lines]))
-    top.epilog = "\n\n".join([*families, EXAMPLES])
-    return top
+top = LazyGroup(
+    "pipeline",
+    help=DESCRIPTION,
+    epilog=EXAMPLES,
+    moved=MOVED,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    sections={
+        "Generate datasets": {
+            "run": Listed("runs", "Generate the datasets of a configuration, or their missing parts."),
+            "status": Listed("runs", "Show wanted and kept episodes, pending stages, disk and time."),
+            "clean": Listed("runs", "Delete files that a run can generate again."),
+        },
+        "Before a run": {
+            "demos": Listed("demos", "Fetch, expand or check demonstrations."),
+            "doctor": Listed("prepare", "Check versions, OpenGL, disk, memory and demonstrations for a run."),
+            "preview": Listed("prepare", "Render perturbations of a task into one picture."),
+            "axes": Listed("prepare", "List the axes of perturbation and their components."),
+            "tasks": Listed("prepare", "List the tasks and their instructions."),
+            "sources": Listed("prepare", "Fetch the textures and objects of a configuration."),
+            "rewrite": Listed("prepare", "Add rewrites of an instruction by a language model to a bank."),
+        },
+        "After a run": {
+            "dataset": Listed("dataset", "Check, audit, regenerate or push a dataset."),
+        },
+        "Policies": {
+            "evaluate": Listed("evaluate", "Run a policy on LIBERO's, LIBERO-Plus's or held-out tasks."),
+            "analyze": Listed("analyze", "Report on results, and compare runs with the test tasks."),
+        },
+        "For contributors": {
+            "schema": Listed("develop", "Write the files of schemas/ that follow from the code."),
+        },
+    },
+)
 
 
 def run() -> int:
@@ -51,16 +70,12 @@ def run() -> int:
     Returns:
         Exit status.
     """
-
-    def command() -> int:
-        arguments = parser().parse_args()
-        try:
-            status = int(arguments.run(arguments) or 0)
-            sys.stdout.flush()  # here, where a reader that is gone can be told, rather than when Python ends
-            return status
-        except BrokenPipeError:
-            # Who reads the output, such as `head`, has enough. Nothing must be written to it when Python ends.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
-
-    return exit_status(command)
+    installed = Path(sys.argv[0]).name == "perturbed-demos"
+    try:
+        status: int = top.main(
+            prog_name="perturbed-demos" if installed else "python -m pipeline", standalone_mode=False
+        )
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    return status

@@ -1,103 +1,128 @@
-"""Demonstrations: ``demos fetch``, ``demos expand`` and ``demos check``."""
+"""Group ``demos``: commands that fetch, multiply and check demonstrations."""
 
-import argparse
 import json
+from collections.abc import Iterable
 from dataclasses import asdict
-from typing import Any
+from pathlib import Path
+from typing import Literal
 
-from pipeline.commands.base import add, add_group, argument, at_least_zero, positive, value
+import click
 
-TITLE = "get demonstrations"
+from pipeline.commands.base import PATH, Command, LazyGroup, Listed, OneOf
 
+demos = LazyGroup(
+    "demos",
+    help="Fetch, expand or check demonstrations (HDF5).",
+    sections={
+        "Commands": {
+            "fetch": Listed("demos", "Download LIBERO's demonstrations from the hub."),
+            "expand": Listed("demos", "Generate many demonstrations from the starter set's."),
+            "check": Listed("demos", "Check a folder of demonstrations by reading and replaying them."),
+        }
+    },
+)
 
-def add_commands(commands: Any) -> None:
-    verbs = add_group(
-        commands, "demos", "fetch, expand, check: get LIBERO's, make more from few, look at a folder of them"
-    )
-    out = value("out", "DIR", "folder to use as demos.root afterwards")
-    add(verbs, fetch, out, _suites, value("--endpoint", "URL", "address of a mirror of the hub", str))
-    add(
-        verbs,
-        expand,
-        out,
-        value("--per-task", "N", "demonstrations of each task (default: 10)", positive, default=10),
-        value("--tasks", "PATTERN", "patterns of <suite>/<task> (default: the four suites)", str, nargs="+"),
-        argument(
-            "--starts",
-            choices=("wide", "reset"),
-            default="wide",
-            help="wide: arm and target further away than in LIBERO's own (default); reset: each start is a reset of "
-            "LIBERO's environment",
-        ),
-        argument("--seed", type=int, default=0, help="of every draw (default: 0)"),
-    )
-    replays = "so many demonstrations of each file are replayed (default: 2; 0 for none)"
-    add(
-        verbs,
-        check,
-        value("folder", "DIR", "folder with <suite>/<task>_demo.hdf5"),
-        value("--replay", "N", replays, at_least_zero, default=2),
-        value("--config", "CONFIG", "configuration of the run that they are for; its replay settings are used"),
-    )
+out_argument = click.argument("out", metavar="DIR", type=PATH, help="Folder to use as demos.root afterwards.")
 
 
-def _suites(command: argparse.ArgumentParser) -> None:
+def _suites() -> Iterable[str]:
     from pipeline.libero.tasks import SUITES
 
-    command.add_argument("suites", nargs="+", choices=SUITES, metavar="SUITE", help=f"any of {', '.join(SUITES)}")
+    return SUITES
 
 
-def fetch(arguments: argparse.Namespace) -> None:
-    """download LIBERO's demonstrations (HDF5) from the hub, or go on with a download that was cut short"""
-    from pipeline.libero.fetch import fetch
+@click.command(cls=Command)
+@out_argument
+@click.argument(
+    "suites", metavar="SUITE...", nargs=-1, required=True, type=OneOf(_suites), help="Suites, such as libero_goal."
+)
+@click.option("--endpoint", metavar="URL", help="Address of a mirror of the hub.")
+def fetch(out: Path, suites: tuple[str, ...], endpoint: str | None) -> None:
+    """Download LIBERO's demonstrations (HDF5) from the hub.
 
-    files = fetch(arguments.out, arguments.suites, arguments.endpoint)
-    print(f"{len(files)} files are in {arguments.out}: write `demos: {{root: {arguments.out}}}` into a configuration")
+    A download that was stopped resumes.
+    """
+    from pipeline.libero import fetch
+
+    files = fetch.fetch(out, suites, endpoint)
+    print(f"{len(files)} files are in {out}: write `demos: {{root: {out}}}` into a configuration")
 
 
-def expand(arguments: argparse.Namespace) -> int:
-    """make many demonstrations of each task from the starter set's one, where the hub cannot be reached
+@click.command(cls=Command)
+@out_argument
+@click.option(
+    "--per-task", metavar="N", type=click.IntRange(min=1), default=10, help="Demonstrations of each task (default: 10)."
+)
+@click.option(
+    "--tasks",
+    metavar="PATTERN",
+    multiple=True,
+    help="Pattern of <suite>/<task>; may be given several times (default: the four suites).",
+)
+@click.option(
+    "--starts",
+    type=click.Choice(("wide", "reset")),
+    default="wide",
+    help="wide: arm and target further away than in LIBERO's own (default); reset: each start is a reset of LIBERO's "
+    "environment.",
+)
+@click.option("--seed", type=int, default=0, help="Seed of all samples (default: 0).")
+def expand(out: Path, per_task: int, tasks: tuple[str, ...], starts: Literal["wide", "reset"], seed: int) -> int:
+    """Generate many demonstrations of each task from the starter set's single one.
 
-    Replays each human demonstration from other starts and writes those that reach the goal in LIBERO's own HDF5 layout
-    (states, actions and scenes; no images). They are marked as expanded in the files and in every dataset made from
-    them.
+    Each human demonstration is replayed from other starts. Those that reach the goal are written in LIBERO's own HDF5
+    layout (states, actions and scenes; no images). They are marked as expanded in the files and in every dataset
+    generated from them. This needs no network. The last line is JSON.
     """
     from pipeline.compute.pool import runner
     from pipeline.compute_config import ComputeConfig
     from pipeline.config import DemosConfig
-    from pipeline.run.expand import candidates, expand, resets
+    from pipeline.run import expand
     from pipeline.testset import benchmark
 
-    demos = DemosConfig(tasks=tuple(arguments.tasks)) if arguments.tasks else DemosConfig()
-    if arguments.starts == "reset":
-        rows = resets(demos, arguments.per_task, arguments.seed)
+    demos = DemosConfig(tasks=tasks) if tasks else DemosConfig()
+    if starts == "reset":
+        rows = expand.resets(demos, per_task, seed)
     else:
-        rows = candidates(demos, arguments.per_task, arguments.seed, benchmark.load())
-    with runner(ComputeConfig(), arguments.out) as workers:
-        made = expand(arguments.out, demos, rows, arguments.per_task, workers)
+        rows = expand.candidates(demos, per_task, seed, benchmark.load())
+    with runner(ComputeConfig(), out) as workers:
+        made = expand.expand(out, demos, rows, per_task, workers)
     print(f"{made.written} demonstrations in {len(made.files)} files", end="")
-    print(f": write `demos: {{root: {arguments.out}}}` into a configuration" if made.files else "")
+    print(f": write `demos: {{root: {out}}}` into a configuration" if made.files else "")
     for task, missing in made.short.items():
         print(f"{missing} fewer than asked for of {task}")
     print(json.dumps({"written": made.written, "dropped": dict(made.dropped.most_common()), "short": made.short}))
     return int(not made.files)
 
 
-def check(arguments: argparse.Namespace) -> int:
-    """open every file of a folder of demonstrations (HDF5), replay two of each, and name file and fault
+@click.command(cls=Command)
+@click.argument("folder", metavar="DIR", type=PATH, help="Folder with <suite>/<task>_demo.hdf5.")
+@click.option(
+    "--replay",
+    "number",
+    metavar="N",
+    type=click.IntRange(min=0),
+    default=2,
+    help="Demonstrations of each file to replay (default: 2; 0 for none).",
+)
+@click.option(
+    "--config", metavar="CONFIG", type=PATH, help="Configuration of the intended run, whose replay settings are used."
+)
+def check(folder: Path, number: int, config: Path | None) -> int:
+    """Check a folder of demonstrations (HDF5) by reading and replaying them.
 
-    Every demonstration is read and checked. Of each file two are also replayed as the run of --config would, or by the
-    default settings: open-loop and, where that misses the goal, tracked. A miss is listed. If all of a file miss, each
-    is a fault, and other settings are tried. The last line is JSON. Ends with 1 where there is a fault.
+    Every demonstration is read and checked. Two of each file are also replayed, open-loop and, if that misses the goal,
+    tracked. A miss is listed. If all replays of a file miss, each is an error, and other settings are tried. The last
+    line is JSON. The exit status is 1 if there is an error.
     """
     from pipeline.compute.pool import runner
     from pipeline.compute_config import ComputeConfig
     from pipeline.config import ReplayConfig, load
-    from pipeline.validation.demonstrations import check
+    from pipeline.validation import demonstrations
 
-    replay = load(arguments.config).replay if arguments.config else ReplayConfig()
-    with runner(ComputeConfig(), arguments.folder) as run:
-        report = check(arguments.folder, arguments.replay, run, replay)
+    settings = load(config).replay if config else ReplayConfig()
+    with runner(ComputeConfig(), folder) as workers:
+        report = demonstrations.check(folder, number, workers, settings)
     for line in (*report.notes, *report.faults):
         print(line)
     print(json.dumps(asdict(report)))

@@ -1,18 +1,14 @@
 """Commands for contributors."""
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.commands.base import add
+import click
 
-TITLE = "for contributors"
+from pipeline.commands.base import Command
+
 SCHEMAS = Path(__file__).parents[2] / "schemas"
-
-
-def add_commands(commands: Any) -> None:
-    add(commands, schema)
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -25,8 +21,9 @@ def schemas() -> dict[str, dict[str, Any]]:
     return {"config.schema.json": config, "manifest.json": manifest.described(registry.columns())}
 
 
-def schema(arguments: argparse.Namespace) -> None:
-    """write the files of schemas/ that follow from the code"""
+@click.command(cls=Command)
+def schema() -> None:
+    """Write the files of schemas/ that follow from the code."""
     from pipeline.files import write
 
     for name, content in schemas().items():

@@ -1,45 +1,41 @@
-"""Commands that make datasets: ``run``, ``status`` and ``clean``."""
+"""Commands that generate datasets: ``run``, ``status`` and ``clean``."""
 
 from __future__ import annotations
 
-import argparse
 import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from pipeline.commands.base import add, add_config, owned, value
+import click
+
+from pipeline.commands.base import Command, OneOf, config_argument, open_run
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
     from pipeline.run.run import Run
 
-TITLE = "make datasets"
 
+@click.command(cls=Command)
+@config_argument
+def run(config: Path) -> None:
+    """Generate the datasets of a configuration, or their missing parts, and list them.
 
-def add_commands(commands: Any) -> None:
-    add(commands, run, value("config", "CONFIG", "file of the run's configuration, such as configs/starter.yaml"))
-    add(commands, status, add_config)
-    add(commands, clean, _clean_arguments)
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """make the datasets of a configuration, or what of them is not made yet, and say where they are
-
-    Performs the stages in order, each only if something is to do. Stopped at any time, it resumes when it is called
-    again. The configuration may be any file; the run's folder is <folder>/<name>, by default data/<name>, below the
-    folder that the command is called in.
+    The stages are performed in order. A stage whose results are up to date is left out. A run can be stopped at any
+    time and resumes when the command is called again. The configuration may be any file. The folder of the run is
+    <folder>/<name>, by default data/<name>, below the current folder.
     """
     from pipeline import stages
     from pipeline.run import counts
 
-    run = stages.run_all(arguments.config)
+    finished = stages.run_all(config)
     print()
-    places = {name: path for name, path in results(run).items() if path.exists()}
+    places = {name: path for name, path in results(finished).items() if path.exists()}
     width = max(map(len, places))
     for name, path in places.items():
         print(f"{name:>{width}}  {path}")
-    rows = run.manifest
-    for sentence in counts.shortfalls(counts.targets(rows, run.config.plan.episodes)):
+    rows = finished.manifest
+    for sentence in counts.shortfalls(counts.targets(rows, finished.config.plan.episodes)):
         print(sentence)
 
 
@@ -58,44 +54,47 @@ def results(run: Run) -> dict[str, Path]:
     }
 
 
-def status(arguments: argparse.Namespace) -> None:
-    """say how many episodes are wanted and kept, what would run and why, its disk and time; changes nothing"""
+@click.command(cls=Command)
+@config_argument
+def status(config: Path) -> None:
+    """Show wanted and kept episodes, the stages that would run and why, and their disk and time.
+
+    Nothing is changed.
+    """
     from rich.console import Console
 
-    from pipeline.validation import status
+    from pipeline import status
 
-    run = owned(arguments)
     console = Console(soft_wrap=True, highlight=False)
-    for part in status.told(run):
+    for part in status.told(open_run(config)):
         console.print(part)
 
 
-def _clean_arguments(command: argparse.ArgumentParser) -> None:
+def _parts() -> Iterable[str]:
     from pipeline.run import cleaning
 
-    add_config(command)
-    command.add_argument(
-        "--only",
-        action="append",
-        choices=cleaning.PARTS,
-        metavar="PART",
-        help=f"{', '.join(cleaning.PARTS)}; may be given several times",
-    )
-    command.add_argument("--yes", action="store_true", help="do not ask")
+    return cleaning.PARTS
 
 
-def clean(arguments: argparse.Namespace) -> None:
-    """delete what can be made again of a run, after it was listed with its sizes and you said yes
+@click.command(cls=Command)
+@config_argument
+@click.option(
+    "--only", multiple=True, type=OneOf(_parts), metavar="PART", help="A part to delete; may be given several times."
+)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
+    """Delete files that a run can generate again.
 
-    Other files in the run's folder stay. Demonstrations, configurations and downloads are not touched. A folder that no
-    run has marked, and a file that no stage made inside a folder to delete, are errors.
+    The parts and their sizes are listed before you are asked. Other files in the folder of the run stay.
+    Demonstrations, configurations and downloads are not touched. A folder that no run has marked is an error, and so
+    is a foreign file inside a folder to delete.
     """
     from pipeline.generated import edits_in_words
     from pipeline.run import claim, cleaning, foreign
 
-    run = owned(arguments)
+    run = open_run(config)
     claim.refuse_unmarked(run.folder)
-    size_of_part = cleaning.found(run, arguments.only or tuple(cleaning.PARTS))
+    size_of_part = cleaning.found(run, only or tuple(cleaning.PARTS))
     if not size_of_part:
         print(f"{run.folder} has nothing of this")
         return
@@ -108,7 +107,7 @@ def clean(arguments: argparse.Namespace) -> None:
     for part in size_of_part:
         names += cleaning.PARTS[part].names
     foreign.refuse_foreign_files(run.folder, names)
-    if not arguments.yes:
+    if not yes:
         if not sys.stdin.isatty():
             raise PipelineError("nothing was deleted, as nobody can be asked here", remedy="add --yes")
         if input("Delete all of this? [y/N] ").strip().lower() not in ("y", "yes"):

@@ -21,8 +21,9 @@ from packaging.requirements import Requirement
 from pipeline.compute.workers import VARIABLES
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, schema_file
+from pipeline.formats.registry import FORMATS
 from pipeline.identity import DISTRIBUTION, PACKAGES
-from pipeline.machine_code import SETTINGS, in_shell, machine_code
+from pipeline.machine_code import MACHINE_CODE_VARIABLES, in_shell, machine_code
 from pipeline.seeding import digest
 
 Item = TypeVar("Item")
@@ -104,7 +105,8 @@ def setup() -> dict[str, str]:
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
         required = [Requirement(line).name for line in requires(DISTRIBUTION) or []]
-        for name in (DISTRIBUTION, *required, *chain.from_iterable(PACKAGES.values())):
+        of_formats = [kind.packages for kind in FORMATS]
+        for name in (DISTRIBUTION, *required, *chain.from_iterable([*PACKAGES.values(), *of_formats])):
             versions[name] = version(name)
     except PackageNotFoundError as error:
         versions[str(error.name)] = "not installed"
@@ -158,7 +160,8 @@ def _refusal(where: str, faults: list[str]) -> PipelineError:
         where=where,
         expected="workers that share the run's folders, packages, code and machine code, with one thread each",
         remedy="mount the repository and its data at the same path everywhere, install the same requirements.lock, and "
-        f"start the workers again with `export {in_shell(SETTINGS | VARIABLES)}; dask worker ADDRESS --nthreads 1`",
+        f"start the workers again with `export {in_shell(MACHINE_CODE_VARIABLES | VARIABLES)}; "
+        "dask worker ADDRESS --nthreads 1`",
     )
 
 

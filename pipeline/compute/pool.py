@@ -85,8 +85,8 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 
 
 @contextmanager
-def runner(config: ComputeConfig, folder: Path, renders: bool = False) -> Iterator[Workers]:
-    """Yield the function that runs work on the workers that ``config.cluster`` names; they start with the first work.
+def runner(compute_config: ComputeConfig, folder: Path, renders: bool = False) -> Iterator[Workers]:
+    """Yield the function that runs work on the workers of ``compute_config.cluster``; they start with the first work.
 
     The first work raises a ``PipelineError`` if no scheduler answers, or a worker cannot work for this run.
 
@@ -94,7 +94,7 @@ def runner(config: ComputeConfig, folder: Path, renders: bool = False) -> Iterat
         folder: folder that the work writes into; the workers of an external cluster must see it too.
         renders: True if the work renders. Local workers then render with the device that this process has chosen.
     """
-    if config.cluster == "loop":
+    if compute_config.cluster == "loop":
         yield loop
         return
     with ExitStack() as opened:
@@ -102,14 +102,14 @@ def runner(config: ComputeConfig, folder: Path, renders: bool = False) -> Iterat
 
         def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
             if items and not workers:
-                workers.append(opened.enter_context(_started(config, folder, renders)))
+                workers.append(opened.enter_context(_started(compute_config, folder, renders)))
             return workers[0](fn, items, description) if items else []
 
         yield run
 
 
 @contextmanager
-def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Workers]:
+def _started(compute_config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Workers]:
     import dask
     from distributed import Client
 
@@ -126,22 +126,22 @@ def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Wo
             "distributed.deploy.lost-worker-timeout": "5s",
         }
     )
-    if config.cluster == "local":
-        with local_cluster(config.workers, renders) as (client, refill):
+    if compute_config.cluster == "local":
+        with local_cluster(compute_config.workers, renders) as (client, refill):
             yield _Workers(client, refill=refill)
-    elif config.cluster == "slurm":
-        with slurm_jobs(config, folder) as jobs, Client(jobs.cluster) as client:
+    elif compute_config.cluster == "slurm":
+        with slurm_jobs(compute_config, folder) as jobs, Client(jobs.cluster) as client:
             jobs.wait_for_one(client)
             with workplace_of(client, folder) as workplace:
                 # Jobs may wait in the queue for hours.
                 yield _Workers(client, workplace, jobs.refill, patience_s=inf)
     else:
         try:
-            client = Client(config.cluster, timeout=CONNECT_S)
+            client = Client(compute_config.cluster, timeout=CONNECT_S)
         except (OSError, ValueError) as error:
             raise PipelineError(
                 f"no Dask scheduler answers ({error})",
-                where=config.cluster,
+                where=compute_config.cluster,
                 remedy="start one, or set compute.cluster: local",
             ) from error
         with client, workplace_of(client, folder) as workplace:

@@ -13,7 +13,7 @@ from pipeline.compute.workers import VARIABLES
 from pipeline.compute_config import JOB_GB, ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
-from pipeline.machine_code import SETTINGS, in_shell
+from pipeline.machine_code import MACHINE_CODE_VARIABLES, in_shell
 
 LOGS = Path(".work") / "slurm"
 """Folder, below the run's, of the jobs' output."""
@@ -107,14 +107,14 @@ class SlurmJobs:
 
 
 @contextmanager
-def slurm_jobs(config: ComputeConfig, folder: Path) -> Iterator[SlurmJobs]:
+def slurm_jobs(compute_config: ComputeConfig, folder: Path) -> Iterator[SlurmJobs]:
     """Start a scheduler in this process and submit a job for each worker; cancel the jobs when the block ends.
 
     The site's settings in ``jobqueue.yaml`` apply. Our lists are appended to the site's lists, so that ours decide if
     both name the same option.
 
     Args:
-        config: section with ``cluster: slurm``.
+        compute_config: section with ``cluster: slurm``.
         folder: folder that the work writes into; the nodes must see it too.
 
     Raises:
@@ -122,11 +122,11 @@ def slurm_jobs(config: ComputeConfig, folder: Path) -> Iterator[SlurmJobs]:
     """
     from dask_jobqueue.slurm import SLURMCluster
 
-    job, workers = config.slurm or SlurmConfig(), config.workers or 1
+    job, workers = compute_config.slurm or SlurmConfig(), compute_config.workers or 1
     logs = (folder / LOGS).absolute()
     logs.mkdir(parents=True, exist_ok=True)
     # A site may keep the environment of the submitting process from its jobs.
-    environment = f"export {in_shell(SETTINGS | VARIABLES | {'LP_NUM_THREADS': '1'})}"
+    environment = f"export {in_shell(MACHINE_CODE_VARIABLES | VARIABLES | {'LP_NUM_THREADS': '1'})}"
     cluster = SLURMCluster(
         cores=1,
         processes=1,

@@ -36,7 +36,7 @@ from pipeline.files import replaced
 from pipeline.types import Floats
 
 TITLE = "perturbed-demos: compositional gap"
-"""Title in the metadata of a heat map; `analyse gap` recognises its own files by this title."""
+"""Title in the metadata of a heat map; `analyze gap` recognises its own files by this title."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, field_serializer
 
-from pipeline.axes import Perturbation
+from pipeline.axes import AXES, Perturbation
 from pipeline.axes.base import Frozen
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
@@ -211,22 +211,21 @@ class EpisodeEnvironment:
     def _start_test_task(self) -> None:
         """Start an episode of a test task of LIBERO-Plus."""
         test = self._test
-        posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
         state = libero_states(self._base)[0]
-        if test.axis in ("light", "background"):
+        source = AXES[test.axis].test_scene
+        if source == "libero":
+            self._build(self._base)
+        elif source == "scene files":
             assets = self._assets(test)
             files = SceneFiles(*(str(assets / path) for path in libero_plus.scene_files(test)))
             self._build(self._base, test.name, files)
-        elif test.axis in ("pose", "layout"):
-            if test.axis == "layout":
+        else:
+            if source == "bddl and models":
                 libero_plus.register_objects(test, self._assets(test))
             self._build_from(libero_plus.bddl_text(test), test.name)
             state = libero_plus.moved_state(test.suite, test.name)
-        else:
-            self._build(self._base)
-        noise = (libero_plus.noise(test, self.settings.seed),) if test.axis == "noise" else ()
-        self.perturbations = (libero_plus.camera(test), *noise)
-        self._start(self.settings.fixture_seed, state, posture)
+        self.perturbations = libero_plus.frame_changes(test, self.settings.seed)
+        self._start(self.settings.fixture_seed, state, libero_plus.posture_rad(test))
 
     def _start_goal(self) -> None:
         """Start an episode of a LIBERO task with a replaced goal object."""

@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 
 from pipeline import gl
+from pipeline.axes import AXES
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
@@ -33,9 +34,6 @@ EPISODES_A_JOB = 10
 
 JOBS_A_WORKER = 4
 """Number of jobs per worker below which jobs get smaller, so that all workers end at a similar time."""
-
-SCENE_AXES = ("pose", "layout", "light", "background")
-"""Axes whose test tasks each have their own scene."""
 
 FAILURES_IN_A_ROW = 3
 """Number of consecutive episodes without an action from the policy after which a worker stops the evaluation."""
@@ -95,14 +93,17 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
 
 
 def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
-    """Divide tasks into jobs of one scene each, in which the tasks of one posture of the arm follow each other."""
+    """Divide tasks into jobs of one scene each, in which the tasks of one axis follow each other.
+
+    Tasks of the robot axis reset the arm to other postures; all other test tasks in a scene share one reset.
+    """
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
-        own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
+        own_scene = task.source == "libero_plus" and AXES[task.axis].test_scene != "libero"
         moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
     for scene in scenes.values():
-        scene.sort(key=lambda task: (task.axis == "robot", task.number, task.name))
+        scene.sort(key=lambda task: (task.axis, task.number, task.name))
     spread = len(missing) if workers == 1 else max(1, len(missing) // (workers * JOBS_A_WORKER))
     size = min(spread, EPISODES_A_JOB)
     jobs: list[tuple[EvaluationTask, ...]] = []
@@ -259,18 +260,18 @@ def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvi
 
 
 @lru_cache(maxsize=1)
-def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
+def _policy(policy_config: PolicyConfig, identity: str, look_every: int) -> Policy:
     """Return this process's policy.
 
     Raises:
         PipelineError: if it is not the policy with which the evaluation began.
     """
-    policy = config.open(look_every)
+    policy = policy_config.open(look_every)
     # The identity is computed after loading: files that changed before they were loaded still differ now.
-    if config.identity() != identity:
+    if policy_config.identity() != identity:
         raise PipelineError(
             "the checkpoint has changed since the evaluation began",
-            where=config.address,
+            where=policy_config.address,
             expected="one policy for the whole evaluation, such as a folder that no training writes into",
             remedy="run the same command again",
         )

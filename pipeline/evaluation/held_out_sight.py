@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.axes import Perturbation, RenderPerturbation, to_json
-from pipeline.axes.layout import LayoutPerturbation
+from pipeline.axes import Perturbation, to_json
 from pipeline.grouping import grouped
 from pipeline.physics.replay import roll_out
 from pipeline.planning.streams import streams_of
@@ -13,11 +12,6 @@ from pipeline.rendering.renderer import LastScene
 from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
-
-
-def can_hide(perturbation: Perturbation) -> bool:
-    """Return whether a perturbation can hide too much: it changes the frames, or adds objects."""
-    return isinstance(perturbation, RenderPerturbation | LayoutPerturbation)
 
 
 def fault(scene: Scene, demo: Demo, perturbations: Sequence[Perturbation], opened: LastScene) -> str | None:

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes import level_of_test
+from pipeline.axes import AXES, Perturbation, level_of_test
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoisePerturbation, effect_of
 from pipeline.errors import PipelineError
@@ -34,7 +34,7 @@ from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import Reader, SceneFiles
 from pipeline.types import Floats
 
-RUNNABLE = ("camera", "robot", "noise", "language", "pose")
+RUNNABLE = tuple(name for name, axis in AXES.items() if axis.dimension and axis.test_scene in ("libero", "bddl"))
 """Axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
 
 DECIMALS = 4
@@ -111,6 +111,22 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
         "seed": task_seed,
     }
     return NoisePerturbation.model_validate(fields)
+
+
+def frame_changes(test: TestTask, seed: int) -> tuple[Perturbation, ...]:
+    """Return the changes of the frames of a test task in its scene: the agent view, and the corruption of a noise task.
+
+    Args:
+        seed: seed of the noise, see ``noise``.
+    """
+    if test.axis == "noise":
+        return camera(test), noise(test, seed)
+    return (camera(test),)
+
+
+def posture_rad(test: TestTask) -> tuple[float, ...] | None:
+    """Return the (7,) joint angles in which a robot task resets the arm, ``None`` for a test task on another axis."""
+    return postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
 
 
 @cache
@@ -224,9 +240,13 @@ def contents(test: TestTask, archive: Path | None) -> list[str]:
 
 def _named(test: TestTask) -> Iterable[str]:
     """List the asset files that a test task names, by their paths in the archive."""
-    if test.axis == "layout":
-        return object_models(test).values()
-    return scene_files(test) if test.axis in ("light", "background") else ()
+    match AXES[test.axis].test_scene:
+        case "bddl and models":
+            return object_models(test).values()
+        case "scene files":
+            return scene_files(test)
+        case _:
+            return ()
 
 
 @cache

@@ -117,7 +117,7 @@ def drawn_scene(
         if isinstance(perturbation, PhysicsPerturbation):
             scene = moved if scene is None else perturbation.apply(scene, demo, roll_out)
         perturbations.append(perturbation)
-    if len(perturbations) > 1 and any(map(held_out_sight.can_hide, perturbations)):
+    if len(perturbations) > 1 and any(change.can_hide for change in perturbations):
         fault = held_out_sight.fault(scene or nominal(), demo, perturbations, opened)
         if fault:
             raise RefusedError(fault)
@@ -149,7 +149,7 @@ def _scene_with(
             scene = perturbation.apply(scene, demo, roll_out)
         except RefusedError:
             return None
-    if held_out_sight.can_hide(perturbation) and held_out_sight.fault(scene, demo, (perturbation,), opened):
+    if perturbation.can_hide and held_out_sight.fault(scene, demo, (perturbation,), opened):
         return None
     return scene
 

@@ -15,6 +15,7 @@ from pydantic import Field
 from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
+from pipeline.axes.component_names import stored_names
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, own_draws
 from pipeline.evaluation.actions import checked_actions
@@ -125,7 +126,8 @@ class Evaluation:
 
     def episode(self, task: EvaluationTask) -> str:
         """Compute the name of an episode, a digest of its inputs."""
-        return digest("evaluation", asdict(task), self.settings.model_dump(), self.identity)[:16]
+        stored = asdict(task) | {"component": stored_names(task.component)}
+        return digest("evaluation", stored, self.settings.model_dump(), self.identity)[:16]
 
     def result(self, task: EvaluationTask) -> EpisodeResult | None:
         """Return the stored result of an episode if it is up to date, else `None`."""

@@ -34,8 +34,10 @@ INITIAL_STATES = 50
 COLUMNS = {"suites": "suite", "axes": "axis", "components": "component", "levels": "level"}
 """Field of a selection to the field of a task that it restricts."""
 
-PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
-"""Axes of the six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
+PAIR_AXES = tuple(name for name in OWN_AXES if AXES[name].dimension == name)
+"""Axes of the six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise.
+
+Each has the name of its dimension; pose is a second axis of the dimension layout."""
 
 CANDIDATES = 500
 """Number of candidates of each axis in each suite, spread evenly over tasks and levels."""
@@ -52,7 +54,7 @@ class Selection(Frozen, use_attribute_docstrings=True):
     asked for another object of their scene (``goals``); for every two axes LIBERO's task, a held-out perturbation on
     either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
-    """list of tasks that ``analyse construct`` wrote, in place of a source"""
+    """list of tasks that ``analyze construct`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES
     """only these suites"""
     axes: tuple[str, ...] = ()
@@ -274,8 +276,8 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
             f"{counts} of {len(wanted)} tasks need files of LIBERO-Plus's asset archive",
             where="axes" if archive is None else archive,
             expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}, or 62 of background in libero_object",
-            remedy=f"name the unpacked archive: --assets DIR; or --axis {' '.join(libero_plus.RUNNABLE)}; or held-out "
-            "perturbations on the same axes: --source own",
+            remedy=f"name the unpacked archive: --assets DIR; or --axis {' --axis '.join(libero_plus.RUNNABLE)}; or "
+            "held-out perturbations on the same axes: --source own",
         )
     if missing:
         print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")

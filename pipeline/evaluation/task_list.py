@@ -35,7 +35,7 @@ class TaskList(BaseModel):
 
 
 def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
-    """Read the tasks that ``analyse construct`` or ``analyse grade`` listed.
+    """Read the tasks that ``analyze construct`` or ``analyze grade`` listed.
 
     Raises:
         PipelineError: if the file is not such a list, or has perturbations of another seed or version.
@@ -45,7 +45,7 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
         drawn = listed.drawn()
     except (OSError, ValueError, LookupError) as error:
         raise PipelineError(
-            f"not a list of tasks ({error})", where=file, expected="a file that `analyse construct` wrote"
+            f"not a list of tasks ({error})", where=file, expected="a file that `analyze construct` wrote"
         ) from error
     if listed.seed != seed:
         raise PipelineError(

@@ -13,11 +13,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import zip_longest
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BeforeValidator
 
 from pipeline import seeding
+from pipeline.axes.component_names import current_names, stored_names
 from pipeline.axes.language_goal import found, pattern, thing_words, words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
@@ -59,7 +61,7 @@ class EvaluationTask:
     base: str
     name: str
     axis: str
-    component: str
+    component: Annotated[str, BeforeValidator(current_names)]
     level: int
     number: int
 
@@ -118,7 +120,13 @@ def _in_turn(wanted: list[EvaluationTask], columns: tuple[str, ...], seed: int) 
         return sorted(wanted, key=lambda task: seeding.digest("subset", seed, str(task)))
     column, *rest = columns
     groups = grouped((getattr(task, column), task) for task in wanted)
-    names = sorted(groups, key=lambda name: seeding.digest("turn", seed, column, name, str(min(groups[name]))))
+
+    def turn_of(name: str | int) -> str:
+        """Return the sort key of a group; it does not change if the group's component is renamed."""
+        stored = stored_names(name) if isinstance(name, str) else name
+        return seeding.digest("turn", seed, column, stored, str(min(groups[name])))
+
+    names = sorted(groups, key=turn_of)
     rows = [_in_turn(groups[name], tuple(rest), seed) for name in names]
     ordered: list[EvaluationTask] = []
     for turn in zip_longest(*rows):

@@ -1,6 +1,6 @@
 """Interface of an output format: an object that writes a dataset, reads it back, and describes its contents.
 
-A new format is a subclass of ``Format`` in a file of its own and a line in ``registry.py``. Every listing of formats
+A new format is a subclass of ``Format`` in a file of its own and a line in ``registry.py``. Reading a configuration
 imports it, so methods import the heavy libraries that they need.
 """
 
@@ -9,23 +9,59 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import pyarrow as pa
-from pydantic import BaseModel
+from pydantic import AfterValidator, Field
 
 from pipeline.episode_schema import SCHEMA, GripperSpec
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
-from pipeline.identity import Step
+from pipeline.identity import made_with_recipe
 from pipeline.record import Basis, Record
-from pipeline.types import Extra
+from pipeline.types import LONGEST_NAME, Extra, Frozen
 
 Row = Mapping[str, Any]
 """A row of the manifest."""
 
-Options = TypeVar("Options", bound=BaseModel)
+
+def _of_some(share: float) -> float:
+    if 0 < share < 0.001:
+        raise ValueError("expected 0, or 0.001 to 0.5")
+    return share
+
+
+Share = Annotated[float, Field(ge=0.0, le=0.5), AfterValidator(_of_some)]
+
+Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$", max_length=LONGEST_NAME)]
+"""Name of a dataset; ``Config`` replaces an empty name by ``libero_`` and the name of the run."""
+
+
+class FormatOptions(Frozen):
+    """Options of every format, and base class of a format's own options.
+
+    The identity of a finished dataset depends on their serialization, aliases included: a field that is added later is
+    excluded at its default.
+
+    Attributes:
+        name: name of the dataset, or first part of the names of its sets.
+        validation: share of each task's demonstrations in the split ``val``; a format declares it after its own fields.
+    """
+
+    name: Name = ""
+    if TYPE_CHECKING:
+        validation: Share = 0.0
+
+    def refuse_name(self) -> None:
+        """Reject a name under which a client would misread the dataset.
+
+        Raises:
+            ValueError: naming the client.
+        """
+
+
+Options = TypeVar("Options", bound=FormatOptions)
 
 
 @dataclass(frozen=True)
@@ -82,15 +118,25 @@ class Format(ABC, Generic[Options]):
         extras: content of the episodes in addition to the frames.
     """
 
-    name: ClassVar[Step]
-    """Name in the configuration's section ``export``, on the command line and in ``pipeline/identity.py``, and of the
-    folder and the record in ``data/<run>``."""
+    name: ClassVar[str]
+    """Name in the configuration's section ``export``, on the command line and of the recipe, and of the folder and the
+    record in ``data/<run>``."""
     title: ClassVar[str]
     """Name for people, and the hub's tag."""
+    options_type: ClassVar[type[FormatOptions]]
+    """Model of its options, the field ``name`` of the section ``export``; the class ``Options`` of the type."""
+    by_default: ClassVar[bool] = False
+    """True if a run writes the format unless its configuration says ``null``."""
+    recipe: ClassVar[int]
+    """Recipe number (see ``pipeline/identity.py``); the commit that raised it describes the change."""
+    packages: ClassVar[tuple[str, ...]]
+    """Packages that compute the bytes of the files."""
     group: ClassVar[str]
     """Name of the format that is written by the same stage, ``export_<group>``; most often the format's own name."""
     rewrites_instructions: ClassVar[bool] = False
     """True if the format can store rewrites of instructions, which depend on the plan's language axis."""
+    splits_each_suite: ClassVar[bool] = False
+    """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
     step_s: ClassVar[float]
     """CPU time of one core to write one step of an episode, in s, on the reference machine of ``work_time.py``."""
     columns: ClassVar[tuple[pa.Field, ...]]
@@ -107,6 +153,11 @@ class Format(ABC, Generic[Options]):
         self.data = data
         self.options = options
         self.extras = tuple(extras)
+
+    @classmethod
+    def made_with(cls) -> dict[str, str]:
+        """Map names for people to the recipe, the package versions and the machine code of the files."""
+        return made_with_recipe(cls.name, cls.recipe, cls.packages)
 
     @property
     def folder(self) -> Path:
@@ -126,13 +177,6 @@ class Format(ABC, Generic[Options]):
     @property
     def record_file(self) -> Path:
         return self.data / f"{self.name}.json"
-
-    @property
-    def stage_record(self) -> Path:
-        """Return the record that is an output of the format's stage in DVC."""
-        # One stage writes the kept episodes and the failures, of all its formats.
-        data = self.data.parent if "outcome" in self.extras else self.data
-        return data / f"{self.group}.json"
 
     @property
     def work(self) -> Path:

@@ -2,14 +2,30 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import NamedTuple
 
 from pipeline.errors import PipelineError
-from pipeline.export_config import too_few, validating
 from pipeline.grouping import grouped
 from pipeline.seeding import digest
 from pipeline.types import Episode
+
+
+def validating(share: float, demonstrations: int) -> int:
+    """Return the number of a task's demonstrations in ``val``: rounded half to even, and 0 for a single one."""
+    return round(share * demonstrations) if demonstrations > 1 else 0
+
+
+def too_few(share: float, where: str) -> PipelineError:
+    """Return the error that no task, in total or in a suite, has enough demonstrations for a share above 0."""
+    least = next(number for number in count(max(2, int(0.5 / share))) if validating(share, number))
+    return PipelineError(
+        f"no task has enough demonstrations for {share:g} of them to go into the split val",
+        where=where,
+        expected=f"{least} or more demonstrations of a task, where all that `demos expand` made from one count as one",
+        remedy="use more demonstrations, a larger share, or 0",
+    )
+
 
 Load = Callable[[str], Episode]
 """Episode id to episode; picklable, called in worker processes."""
@@ -152,8 +168,8 @@ def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
     Their concatenation keeps the caller's order. The number of slices is ``pieces``, or the number of episodes if that
     is smaller.
     """
-    count = min(pieces, len(episode_ids))
-    bounds = [len(episode_ids) * k // count for k in range(count + 1)]
+    slices = min(pieces, len(episode_ids))
+    bounds = [len(episode_ids) * k // slices for k in range(slices + 1)]
     return [list(episode_ids[start:stop]) for start, stop in pairwise(bounds)]
 
 

@@ -8,23 +8,49 @@ from typing import Any, ClassVar
 import pyarrow as pa
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA
-from pipeline.export_config import RldsConfig
-from pipeline.formats.base import Format, Row, StepSizes
+from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, dataset_of, shard_path
-from pipeline.identity import Step
 from pipeline.tables import column
+from pipeline.types import Count
 
 SHARD_MB = 400
 """Target shard size in MB if ``shards`` is not set."""
 
 
+class RldsConfig(FormatOptions):
+    """Options of the RLDS sets.
+
+    Attributes:
+        name: what the sets' names begin with; ``libero_`` and the name of the run when left out.
+        shards: TFRecord files, over all sets; when left out, so many that each has about 400 MB.
+        validation: share of each task's demonstrations whose episodes go into the split ``val`` instead of ``train``.
+    """
+
+    name: Name = ""
+    shards: Count | None = None
+    validation: Share = 0.0
+
+    def refuse_name(self) -> None:
+        # OpenVLA-OFT decides by the name whether it reads a set with LIBERO's constants and cameras.
+        if "libero" not in self.name or "aloha" in self.name:
+            raise ValueError(
+                f"export.rlds.name {self.name!r} would be read with another robot's constants and cameras by "
+                "OpenVLA-OFT, which goes by the name; expected a name with libero and without aloha in it"
+            )
+
+
 class Rlds(Format[RldsConfig]):
     """Sets whose shard k has the k-th slice of the episodes; the ids are shuffled, so neighbours are unrelated."""
 
-    name: ClassVar[Step] = "rlds"
+    name: ClassVar = "rlds"
     title: ClassVar = "RLDS"
+    options_type: ClassVar = RldsConfig
+    by_default: ClassVar = True
+    recipe: ClassVar = 5
+    packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
+    splits_each_suite: ClassVar = True  # OpenVLA-OFT, when it validates, reads the split val of each set.
     group: ClassVar = "rlds"
     step_s: ClassVar = 0.0004
     columns: ClassVar = (

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.types import Frame
-
-if TYPE_CHECKING:
-    from pipeline.config import RenderConfig
+from pipeline.types import Frame, Jpeg
 
 Pixels = TypeVar("Pixels", bound=np.integer)
 
@@ -34,11 +31,11 @@ def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
     return np.asarray(cv2.resize(frame, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def encode(frame: Frame, config: RenderConfig) -> bytes:
+def encode(frame: Frame, jpeg_quality: int) -> Jpeg:
     """Encode an RGB frame as a JPEG file; every dataset carries these bytes or pixels decoded from them."""
     bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-    _, packed = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
-    return packed.tobytes()
+    _, packed = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
+    return Jpeg(packed.tobytes())
 
 
 def encode_exactly(pixels: NDArray[Any]) -> bytes:

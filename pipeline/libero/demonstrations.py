@@ -20,7 +20,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.aliases import as_defined
 from pipeline.libero.assets import package_folder, relocate
-from pipeline.libero.recorder import reject_other_rate, reject_other_settings
+from pipeline.libero.recorder import reject_other_control, reject_other_rate
 from pipeline.libero.tasks import SUITES, base_of_test, find_task, suites, tasks
 from pipeline.origins import REINSTALL
 from pipeline.types import Demo, Floats, Task
@@ -275,7 +275,7 @@ class HDF5Source:
                     where=path,
                     remedy=f"rename it to {recorded}_demo.hdf5",
                 )
-            reject_other_settings(data, f"{path} data")
+            reject_other_control(data, f"{path} data")
             yield data
 
     def _notes(self, task: Task, clipped: Mapping[str, int]) -> Iterator[str]:

@@ -27,7 +27,7 @@ RECORD_AGAIN = (
 )
 
 
-def reject_other_settings(data: h5py.Group, where: str) -> None:
+def reject_other_control(data: h5py.Group, where: str) -> None:
     """Compare the control frequency and the controller that a file states with LIBERO's; a file may state none.
 
     Raises:

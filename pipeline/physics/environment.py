@@ -95,13 +95,13 @@ class Environment:
         # them. Without this deletion, the second placement under a seed differs from the first.
         del env.object_property_initializers[self._openings :]
         self._scene = None
-        usual_settings = env.robot_configs[0]  # each reset creates the robot again from these settings
-        env.robot_configs[0] = {**usual_settings, **robot}
+        usual_robot = env.robot_configs[0]  # each reset creates the robot again from it
+        env.robot_configs[0] = {**usual_robot, **robot}
         try:
             with seeded(seed):
                 until_placed(env.reset, self.task)
         finally:
-            env.robot_configs[0] = usual_settings
+            env.robot_configs[0] = usual_robot
         self._control_step = ControlStep(env)
 
     def _as_mjcf(self) -> str:

@@ -27,7 +27,7 @@ def replay(
     environment: Environment,
     demo: Demo,
     trajectory_id: str,
-    config: ReplayConfig,
+    replay_config: ReplayConfig,
     perturbations: Sequence[PhysicsPerturbation] = (),
     reference: Callable[[], Reference | None] = lambda: None,
 ) -> Trajectory:
@@ -39,7 +39,7 @@ def replay(
         environment: the environment of the demonstration's task.
         demo: the demonstration.
         trajectory_id: the result's id.
-        config: mode, settling and no-op rule of the replay.
+        replay_config: mode, settling and no-op rule of the replay.
         perturbations: changes to apply before the first step.
         reference: returns the reference that tracking follows. If it returns ``None``, the replay is open-loop, also
             in mode ``tracked``; the result states its mode.
@@ -49,7 +49,7 @@ def replay(
     """
     fixed_machine_code()
     try:
-        scene, refused = _perturbed(environment, demo, config, perturbations)
+        scene, refused = _perturbed(environment, demo, replay_config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
         scene = Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)})
@@ -64,18 +64,19 @@ def replay(
         if refused:
             settle_steps, executed_policy = 0, no_actions
         else:
-            settle_steps, executed_policy = config.settle_steps, policy
+            settle_steps, executed_policy = replay_config.settle_steps, policy
         states, actions, alphas, judged = _execute(environment, scene, settle_steps, executed_policy)
         if judged.kept and (fault := _fault_of(perturbations, actions)):
             judged = Verdict(False, fault)
         return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused or judged)
 
     # Recorded actions do not work against a push, so mode ``auto`` tracks pushed scenes even if they reach the goal.
-    tracks = config.mode == "tracked" or (config.mode == "auto" and scene.push is not None and not refused)
+    pushed = scene.push is not None and not refused
+    tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and pushed)
     followed = reference() if tracks else None
     if followed is None:
-        open_loop = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
-        if config.mode != "auto" or open_loop.verdict.kept or refused:
+        open_loop = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, replay_config.noops)]))
+        if replay_config.mode != "auto" or open_loop.verdict.kept or refused:
             return open_loop
         followed = reference()
         if followed is None:
@@ -124,7 +125,7 @@ def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats
 
 
 def _perturbed(
-    environment: Environment, demo: Demo, config: ReplayConfig, perturbations: Sequence[PhysicsPerturbation]
+    environment: Environment, demo: Demo, replay_config: ReplayConfig, perturbations: Sequence[PhysicsPerturbation]
 ) -> tuple[Scene, Verdict | None]:
     """Return the perturbed scene in which the replay starts.
 
@@ -134,13 +135,13 @@ def _perturbed(
     Raises:
         UnusableSceneError: if the recorded scene cannot be restored.
     """
-    model_xml = demo.model_xml or environment.place_fixtures(config.fixture_seed)
-    scene = recorded_start(demo, model_xml, settles=config.settle_steps > 0)
+    model_xml = demo.model_xml or environment.place_fixtures(replay_config.fixture_seed)
+    scene = recorded_start(demo, model_xml, settles=replay_config.settle_steps > 0)
     # Restore the scene first: perturbations compile it too, and would raise other errors.
     environment.restore(scene)
     try:
         for perturbation in perturbations:
-            scene = perturbation.apply(scene, demo, partial(roll_out, config=config))
+            scene = perturbation.apply(scene, demo, partial(roll_out, replay_config=replay_config))
     except RefusedError as error:
         return scene, Verdict(False, error.reason)
     return scene, None
@@ -162,35 +163,35 @@ def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
     return Verdict(False, "goal_lost" if succeeded.any() else "goal_not_reached")
 
 
-def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
+def roll_out(scene: Scene, demo: Demo, replay_config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
     """Execute the demonstration's actions from ``scene``, once it has settled, and return the states (K+1, S).
 
     Args:
         scene: the scene to start in.
         demo: the demonstration.
-        config: settling and no-op rule of the later replay.
+        replay_config: settling and no-op rule of the later replay.
 
     Raises:
         RefusedError: ``simulation_unstable``.
     """
-    actions = demo.actions[kept_actions(demo.actions, config.noops)]
-    return _states_from(scene, demo.task, actions, config)
+    actions = demo.actions[kept_actions(demo.actions, replay_config.noops)]
+    return _states_from(scene, demo.task, actions, replay_config)
 
 
-def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
+def first_look(scene: Scene, task: Task, replay_config: ReplayConfig) -> Floats:
     """Return the state (S,) in which ``scene`` has settled, which the first frame of a replay shows.
 
     Raises:
         RefusedError: ``simulation_unstable``.
     """
-    return np.asarray(_states_from(scene, task, np.empty(0), config)[0])
+    return np.asarray(_states_from(scene, task, np.empty(0), replay_config)[0])
 
 
-def _states_from(scene: Scene, task: Task, actions: Floats, config: ReplayConfig) -> Floats:
+def _states_from(scene: Scene, task: Task, actions: Floats, replay_config: ReplayConfig) -> Floats:
     """Execute actions from a settled scene and return the states (K+1, S), cached by the scene's content."""
     # A scene cannot be hashed; these are the parts of it that a replay depends on.
     start = scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad, scene.push
-    return _states(task, start, actions.tobytes(), config.settle_steps)
+    return _states(task, start, actions.tobytes(), replay_config.settle_steps)
 
 
 _Start = tuple[str, bytes, float, tuple[float, ...] | None, Push | None]

@@ -75,7 +75,8 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     """Sample the plan: a clean twin of every demonstration, then each axis's or combination's candidates, task by task.
 
     A perturbation that comes closer to one of the benchmark's ``test`` tasks than its clearance is sampled again. The
-    benchmark perturbs one axis at a time, but each part of a combination must keep its clearance too.
+    benchmark perturbs one axis at a time, but each part of a combination must keep its clearance too. An axis that is
+    configured to keep no clearance (``Axis.keeps_clearance``) is left as sampled.
 
     Raises:
         PipelineError: when an axis applies to none of the tasks, or a level has no perturbation that keeps its
@@ -95,8 +96,10 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
                 where=f"plan.episodes.{name}",
                 remedy="widen demos.tasks, or take it out of plan.episodes",
             )
+        by_suite = grouped((group[0].task.suite, group[0].task) for group in groups)
         for axis in draws.axes:
-            axis.refuse_tested(test, groups[0][0].task)
+            for tasks in by_suite.values():
+                axis.refuse_tested(test, tasks[0])
         # Each axis has its own order. Else small numbers of episodes would use the same tasks on all axes.
         order = sorted(groups, key=lambda group: digest(plan.seed, name, group[0].task.suite, group[0].task.name))
         more = order[: episodes % len(groups)]
@@ -286,8 +289,9 @@ class Draws:
     ) -> Perturbation | None:
         """Return ``first`` if it is clear, else sample a clear perturbation of its component and level.
 
-        A clear perturbation keeps its clearance to the test set, and the ``instruction`` does not name it. Component
-        and level are kept because strengths near the test set's would otherwise become rare.
+        A clear perturbation keeps its clearance to the test set, unless the axis keeps none, and the ``instruction``
+        does not name it. Component and level are kept because strengths near the test set's would otherwise become
+        rare.
 
         Returns:
             The perturbation. ``None`` if many attempts give no clear one, or if the axis takes the entries of a list:
@@ -295,8 +299,10 @@ class Draws:
         """
 
         def is_clear(perturbation: Perturbation) -> bool:
+            if perturbation.named_in(instruction):
+                return False
             nearest = perturbation.nearest(self.test, task)
-            return nearest.distance >= perturbation.clearance and not perturbation.named_in(instruction)
+            return nearest.distance >= perturbation.clearance or not axis.keeps_clearance
 
         if is_clear(first):
             return first

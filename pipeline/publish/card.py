@@ -17,9 +17,9 @@ from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.clients.recipe import RECIPE
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import validating
 from pipeline.files import checksum, read_json, schema_file
 from pipeline.formats.base import Format
+from pipeline.formats.episodes import validating
 from pipeline.generated import generated
 from pipeline.libero.tasks import SUITES
 from pipeline.publish_config import PublishConfig

@@ -69,7 +69,7 @@ class Upload:
             Run and format, files and megabytes of each folder, the names of files outside the dataset, and the tag.
         """
         folders = grouped((f"{Path(path).parent}/", file.stat().st_size) for path, file in self.files.items())
-        folders["in all"] = [size for sizes in folders.values() for size in sizes]
+        folders["in all"] = [file.stat().st_size for file in self.files.values()]
         lines = [f"run {self.run}, format {self.format}"]
         for name, sizes in folders.items():
             lines.append(f"{len(sizes):6,} files {sum(sizes) / 1e6:10,.1f} MB  {name}")

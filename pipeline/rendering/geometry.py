@@ -17,6 +17,7 @@ from pipeline.libero import bddl
 from pipeline.planning.streams import Stream
 from pipeline.rendering.drawing import Surfaces
 from pipeline.rendering.renderer import Renderer
+from pipeline.scenes.placement import added_names, added_objects
 from pipeline.types import Extra, Floats, Geometry, Task, Trajectory
 
 COMMON = ("nothing", "robot", "gripper", "floor", "wall", "room", "table")
@@ -29,7 +30,7 @@ class Instances:
     """Table of a trajectory's instance names, and the bodies, geoms and sites of each name.
 
     After ``COMMON`` come the fixtures and then the objects, in the order and under the names of the task's BDDL file.
-    Thus an id has one meaning in all episodes of a task. Objects that the layout axis added come last.
+    Thus an id has one meaning in all episodes of a task. Objects that a perturbation added come last.
 
     Attributes:
         names: the name of each id.
@@ -40,8 +41,7 @@ class Instances:
 
     def __init__(self, model: mujoco.MjModel, trajectory: Trajectory, task: Task):
         things = bddl.read(task.bddl_file).things
-        added = [placed["name"] for placed in trajectory.scene.resolved.get("layout", {}).get("objects", [])]
-        self.names: tuple[str, ...] = (*COMMON, *things, *added)
+        self.names: tuple[str, ...] = (*COMMON, *things, *added_names(trajectory.scene.resolved))
         rows = SCHEMA.object_poses.shape[0]
         if len(self.names) > rows:
             raise PipelineError(f"a scene of {task.name} has {len(self.names)} things", expected=f"{rows} or fewer")
@@ -50,8 +50,7 @@ class Instances:
         for body, name in enumerate(bodies):
             if name.endswith("table") and model.body_parentid[body] == 0:
                 self._bodies[TABLE] = body
-        thing_bodies = [f"{thing}_main" for thing in things]
-        thing_bodies += [f"layout{number}" for number in range(len(added))]
+        thing_bodies = [*(f"{thing}_main" for thing in things), *added_objects(model)]
         for instance, body_name in enumerate(thing_bodies, start=len(COMMON)):
             self._bodies[instance] = model.body(body_name).id
         instance_of_root = {body: instance for instance, body in self._bodies.items() if instance != GRIPPER}

@@ -20,7 +20,7 @@ from pipeline.rendering.geometry import Instances, see
 from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception
-from pipeline.types import Floats, Frame, Rendered, Task, Trajectory
+from pipeline.types import Floats, Frame, Jpeg, Rendered, Task, Trajectory
 
 STEPS_AHEAD = 3
 """Steps whose frames a GPU renders while the frames of an earlier step are encoded; a step has up to two views."""
@@ -30,7 +30,7 @@ Started = Mapping[str, Callable[[], Frame]]
 
 
 def render(
-    trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig, opened: LastScene
+    trajectory: Trajectory, task: Task, streams: Sequence[Stream], render_config: RenderConfig, opened: LastScene
 ) -> Rendered:
     """Render the streams of one trajectory of a task: the frame before each executed action.
 
@@ -38,7 +38,7 @@ def render(
     the first frame of its scene is rejected (``FirstFrame``). Streams that differ only in colours share their geometry.
     """
     renderer = opened.renderer(trajectory.model_xml)
-    instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
+    instances = Instances(renderer.model, trajectory, task) if named(render_config.extras) else None
     steps = range(len(trajectory.actions))
     proprioceptions, poses = [], []
     for step in steps:
@@ -48,7 +48,7 @@ def render(
             poses.append(instances.poses(renderer.data))
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
-    encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
+    encoded: dict[str, list[Jpeg]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}
     for changes, scene in grouped((stream.changes, stream) for stream in streams).items():
         with renderer.perturbed(changes):
@@ -58,7 +58,7 @@ def render(
                 continue
             for frames in frames_of_steps(renderer, trajectory, scene):
                 for stream, frame in zip(scene, frames, strict=True):
-                    encoded[stream.stream_id].append(encode(frame, config))
+                    encoded[stream.stream_id].append(encode(frame, render_config.jpeg_quality))
     views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in rejected)
     return Rendered(
         replay_mode=trajectory.mode,
@@ -67,8 +67,8 @@ def render(
         action=trajectory.actions.astype(np.float32),
         streams={stream_id: frames for stream_id, frames in encoded.items() if stream_id not in rejected},
         rejected=rejected,
-        geometry={view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in views},
-        object_poses=np.stack(poses) if "object_poses" in config.extras else None,
+        geometry={view.stream_id: see(renderer, trajectory, view, instances, render_config.extras) for view in views},
+        object_poses=np.stack(poses) if "object_poses" in render_config.extras else None,
         instances=instances.names if instances else (),
         quality=trajectory.quality,
     )

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,9 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
         ``common``: source to the number of episodes that all policies ran, out of the policies that ran the source.
         ``failures``: episodes to show, and whether there is a video.
     """
-    present = {row.source for policy in policies for row in policy.rows}
+    present: set[str] = set()
+    for policy in policies:
+        present |= {row.source for row in policy.rows}
     sources = [*(source for source in SOURCES if source in present), *sorted(present.difference(SOURCES))]
     tested = {
         policy.name: policy.from_source("libero_plus") for policy in policies if policy.from_source("libero_plus")
@@ -100,15 +102,16 @@ def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
     failed = [row for row in policy.rows if not row.success]
     failed.sort(key=lambda row: (row.axis, row.episode not in policy.videos, row.level, row.episode))
     groups = grouped(((row.axis, row.source), row) for row in failed)
-    return [row for group in groups.values() for row in group[:FAILURES]]
+    return list(chain.from_iterable(group[:FAILURES] for group in groups.values()))
 
 
 def _versions(rows: Sequence[EpisodeResult]) -> dict[str, list[str]]:
-    names = dict.fromkeys(name for row in rows for name in row.versions if name not in PER_TASK)
-    versions = {}
-    for name in names:
-        versions[name] = sorted({row.versions[name] for row in rows if name in row.versions})
-    return versions
+    versions: dict[str, set[str]] = {}
+    for row in rows:
+        for name, version in row.versions.items():
+            if name not in PER_TASK:
+                versions.setdefault(name, set()).add(version)
+    return {name: sorted(found) for name, found in versions.items()}
 
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
@@ -120,9 +123,6 @@ COLUMNS = {
     dimension: tuple(name for name, axis in AXES.items() if axis.dimension == dimension) for dimension in DIMENSIONS
 }
 """The paper's dimensions to this project's axes."""
-
-NAMES = {("layout", "objects"): "confounding objects", ("pose", "pose"): "displaced targets"}
-"""Names of the paper for the two components of its layout."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,8 @@ def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
         partly = any(stratum[:2] == kind for stratum in run)
         which = f" level {' and '.join(map(str, levels))}" if partly else ""
         count = sum(sizes[(*kind, level)] for level in levels)
-        descriptions.append(f"{NAMES.get(kind, kind[1])}{which} ({count:,} tasks)")
+        axis, component = kind
+        descriptions.append(f"{AXES[axis].test_name or component}{which} ({count:,} tasks)")
     axes_run = {axis for axis, *_ in run}
     suites = {suite for axis, _, _, suite in _tests() if axis in axes_run}
     return ", ".join([*descriptions, *sorted(suites - {row.suite for row in rows})])

@@ -1,7 +1,7 @@
 """The report of evaluations: one self-contained HTML page, and its content as JSON."""
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from itertools import chain, cycle
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
     files.refuse_other_file(path, "<title>Evaluation: ")
     files.refuse_other_file(json_path, '"paper_table": ')
     found = findings(policies)
-    videos = {episode: file for policy in policies for episode, file in policy.videos.items()}
+    videos = dict(chain.from_iterable(policy.videos.items() for policy in policies))
     files.write(path, page(found, videos))
     files.write_json(json_path, found)
     rates = {}
@@ -115,7 +115,7 @@ def _section(source: str, found: Mapping[str, Any], colours: Mapping[str, str]) 
             results[name] = policy["results"][source]
     groups = {}
     for grouping in (*GROUPINGS, *CLOSER):
-        groups[grouping] = sorted({name for summary in results.values() for name in summary[grouping]})
+        groups[grouping] = sorted(set().union(*(summary[grouping] for summary in results.values())))
 
     def plot(grouping: str, title: str) -> Panel:
         rows: dict[str, list[Share]] = {name: [] for name in groups[grouping]}

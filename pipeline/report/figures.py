@@ -7,6 +7,7 @@ page's text, so that a figure can be read on light and on dark pages.
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -15,15 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
-from numpy.typing import NDArray
 
 from pipeline.axes import AXES
+from pipeline.axes.report_data import REFERENCES, Bars, Groups, Histogram, Plot, Scatter, Strips, Values
 
-Values = NDArray[Any]
-Groups = Mapping[str, Values]
-"""Values plotted in one colour, by name; groups in ``REFERENCES`` are plotted behind the others, in grey."""
-
-REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
 COLOURS = {name: axis.colour for name, axis in AXES.items()}
 OTHER = "#b0794a"
@@ -55,6 +51,8 @@ DOTS_DPI = 220
 
 
 class Panel(NamedTuple):
+    """One pair of axes as an SVG picture, with its title."""
+
     title: str
     svg: str
 
@@ -78,6 +76,19 @@ def panel(title: str, plot: Callable[[Axes], None], height_in: float = HEIGHT_IN
     # HTML knows the namespaces, and numbered names would clash between the figures of a page.
     plotted = re.sub(r' xmlns(:xlink)?="[^"]*"| id="[a-z0-9_.]+_\d+"', "", plotted)
     return Panel(title, plotted.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1))
+
+
+def plot(described: Plot) -> Panel:
+    """Plot what an axis describes."""
+    match described:
+        case Scatter(title, groups, x_label, y_label, equal):
+            return scatter(title, groups, x_label, y_label, equal)
+        case Histogram(title, groups, bins, label):
+            return histogram(title, groups, bins, label)
+        case Strips(title, rows, label):
+            return strips(title, rows, label)
+        case Bars(title, counts, group, label):
+            return bars(title, counts, group, label)
 
 
 def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = False) -> Panel:
@@ -145,7 +156,7 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
         axes.set_yticks(range(len(rows)), [name.replace("+", "+\n") for name in rows])
         axes.set(xlabel=label, ylim=(len(rows) - 0.5, -0.5))
         axes.grid(visible=False, axis="y")
-        plotted = np.concatenate([values for groups in rows.values() for values in groups.values()])
+        plotted = np.concatenate(list(chain.from_iterable(groups.values() for groups in rows.values())))
         axes.xaxis.set_major_locator(
             MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((plotted == plotted.round()).all()))
         )

@@ -15,7 +15,7 @@ from pipeline.images.jpeg import decode
 from pipeline.images.mp4 import mp4
 from pipeline.report import figures
 from pipeline.report.sheets import MOMENT
-from pipeline.types import Frame
+from pipeline.types import Frame, Jpeg
 
 PICTURE_PX, PICTURE_QUALITY = 1100, 80
 """Largest width of a picture, at which captions of a contact sheet can be read, and its JPEG quality."""
@@ -62,7 +62,7 @@ def picture(image: Image.Image) -> str:
     return _address("image/jpeg", packed.getvalue())
 
 
-def beside(twin: Sequence[bytes], episode: Sequence[bytes]) -> Clip:
+def beside(twin: Sequence[Jpeg], episode: Sequence[Jpeg]) -> Clip:
     """Show two episodes' stored frames side by side, in real time; the shorter episode stays at its last frame."""
     frames: list[Frame] = []
     left = right = decode(twin[0])

@@ -1,7 +1,7 @@
-"""Preview: the effect of each axis on a task, as a contact sheet in the manner of the paper's appendix.
+"""Preview: the effect of an axis or a combination on a task, as a contact sheet in the manner of the paper's appendix.
 
-Every picture shows the demonstration's first state, without a replay; a push is shown in its replay. The perturbations
-are the ones that a plan with the same seed samples for the demonstration.
+Every picture shows the demonstration's first state, without a replay; a push is shown in its replay, and in a
+combination at its end. The perturbations are the ones that a plan with the same seed samples for the demonstration.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,6 @@ from pathlib import Path
 from PIL import Image
 
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer
-from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
@@ -61,29 +60,29 @@ class Stage:
     opened: LastScene
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
-    def frames(self, views: Sequence[str], perturbation: Perturbation | None = None) -> list[Frame]:
-        """Render the views, (H, W, 3) each, as a policy sees them.
+    def frames(self, views: Sequence[str], *perturbations: Perturbation) -> list[Frame]:
+        """Render the views, (H, W, 3) each, as a policy sees them under all of the perturbations.
 
         Raises:
-            RefusedError: when the perturbation is impossible in this scene.
+            RefusedError: when a perturbation is impossible in this scene.
         """
-        changes = () if perturbation is None else (perturbation,)
         scene = self.scene
-        for physics in of_layer(changes, PhysicsPerturbation):
-            scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
+        for physics in of_layer(perturbations, PhysicsPerturbation):
+            scene = physics.apply(scene, self.demo, partial(roll_out, replay_config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
         push = scene.push
         if push is None:
             state = first_look(scene, self.demo.task, self.replay)
         else:
             state = roll_out(scene, self.demo, self.replay)[push.first_step + push.steps]
-        return frames_of(renderer, state, renderer.site_alpha, [Stream(view, changes) for view in views], 0)
+        streams = [Stream(view, perturbations) for view in views]
+        return frames_of(renderer, state, renderer.site_alpha, streams, 0)
 
     @cached_property
     def _twin(self) -> Trajectory:
         return replay(shared(self.demo.task), self.demo, "twin", self.replay)
 
-    def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
+    def strip(self, perturbation: Perturbation) -> list[tuple[int, list[Frame]]]:
         """Render the agent view at some steps of a pushed replay, each without the push and with it.
 
         Raises:
@@ -145,70 +144,109 @@ def configured(name: str, config: Config) -> Axis:
     return config.plan.axes.configured().get(name) or AXES[name]()
 
 
+def axes_for(name: str, config: Config) -> tuple[Axis, ...]:
+    """Return the axes of an axis's name or a combination's, such as ``camera+noise``, as a plan would sample them.
+
+    Raises:
+        PipelineError: when an axis has nothing to sample next to the others.
+    """
+    names = name.split("+")
+    try:
+        return tuple(configured(axis, config).beside(names) for axis in names)
+    except ValueError as error:
+        raise PipelineError(str(error), where="plan.axes", remedy="choose other axes") from error
+
+
 def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> list[Perturbation]:
-    """Choose perturbations of the plan that cover the axis's components, and the levels of each component.
+    """Choose perturbations of one axis, as ``combinations`` does of several."""
+    return [perturbation for (perturbation,) in combinations(name, (axis,), demo, seed, test)]
+
+
+def combinations(
+    name: str, axes: Sequence[Axis], demo: Demo, seed: int, test: TestSet
+) -> list[tuple[Perturbation, ...]]:
+    """Choose episodes of the plan that cover the components of each axis, and the levels of each component.
 
     The list is empty if no perturbation keeps the clearance to the test set.
 
+    Returns:
+        For each episode, one perturbation of each axis.
+
     Raises:
-        PipelineError: when the axis has nothing to change in the task, or no perturbation of a level keeps the
+        PipelineError: when an axis has nothing to change in the task, or no perturbation of a level keeps the
             clearance.
     """
-    if not axis.applies(demo.task):
-        what = f"the axis {name} has nothing to change in {demo.task}"
-        raise PipelineError(what, remedy="choose another task or another axis")
-    axis.refuse_tested(test, demo.task)
-    draws = Draws(name, (axis,), seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
-    left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
-    chosen: list[Perturbation] = []
-    count = PHYSICS_VARIANTS if of_layer(left, PhysicsPerturbation) else VARIANTS
+    for axis, axis_name in zip(axes, name.split("+"), strict=True):
+        if not axis.applies(demo.task):
+            what = f"the axis {axis_name} has nothing to change in {demo.task}"
+            raise PipelineError(what, remedy="choose another task or another axis")
+        axis.refuse_tested(test, demo.task)
+    draws = Draws(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
+    left = list(islice(draws, CANDIDATES))
+    chosen: list[tuple[Perturbation, ...]] = []
+    count = PHYSICS_VARIANTS if left and of_layer(left[0], PhysicsPerturbation) else VARIANTS
 
-    def wish(candidate: Perturbation) -> tuple[int, int, int]:
+    def wish(candidate: tuple[Perturbation, ...]) -> tuple[int, int, int]:
         """Rank a candidate: first rare components, then levels far from the chosen levels, then rare levels."""
-        levels = [p.level for p in chosen if p.component == candidate.component]
-        apart = min((abs(level - candidate.level) for level in levels), default=0)
-        return len(levels), -apart, sum(p.level == candidate.level for p in chosen)
+        of_component, apart, of_level = 0, 0, 0
+        for place, perturbation in enumerate(candidate):
+            before = [perturbations[place] for perturbations in chosen]
+            levels = [p.level for p in before if p.component == perturbation.component]
+            of_component += len(levels)
+            apart += min((abs(level - perturbation.level) for level in levels), default=0)
+            of_level += sum(p.level == perturbation.level for p in before)
+        return of_component, -apart, of_level
 
     while left and len(chosen) < count:
         chosen.append(min(left, key=wish))
         left.remove(chosen[-1])
-    return sorted(chosen, key=lambda p: (p.component, p.level))
+    return sorted(chosen, key=lambda perturbations: [(p.component, p.level) for p in perturbations])
 
 
 def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
-    """Render the sheet of one axis: the original top left, then the variants with their parameters.
+    """Render the sheet of an axis or a combination: the original top left, then the variants with their parameters.
 
     A grey tile with the reason stands for a perturbation that is impossible in the scene.
 
     Args:
+        name: an axis, or several joined by + in the order in which they apply (``pipeline.axes.axes_of``).
         test: the benchmark's test tasks, to which the plan's perturbations keep a clearance.
     """
     demo, seed = stage.demo, config.plan.seed
-    drawn = variants(name, configured(name, config), demo, seed, test)
-    changed = frozenset[str]().union(*(p.views for p in drawn)) or {"image"}
+    drawn = combinations(name, axes_for(name, config), demo, seed, test)
+    changed: set[str] = set()
+    for perturbations in drawn:
+        changed.update(*(p.views for p in perturbations))
+    changed = changed or {"image"}
     views = [view for view in SCHEMA.views if view in changed]
     side = SIDE_PX[len(views)]
     original = stage.frames(views)
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
     if not drawn:
         tiles.append(_nothing_drawn(name, tiles[0].picture.size))
-    strips = [tile for push in drawn for tile in _strip(stage, push)]
+    strips: list[Tile] = []
+    for perturbations in drawn:
+        strips += _strip(stage, perturbations)
     if strips:
         tiles, drawn, views = strips, [], ["image"]
-    for perturbation in drawn:
-        caption = describe(perturbation)
+    for perturbations in drawn:
+        caption = "; ".join(map(describe, perturbations))
         try:
             # A perturbation of the words alone changes no frame.
-            frames = stage.frames(views, perturbation) if perturbation.views else original
+            visible = any(p.views for p in perturbations)
+            frames = stage.frames(views, *perturbations) if visible else original
             tiles.append(Tile(side_by_side(frames, side), caption))
         except RefusedError as refused:
             tiles.append(_refused(refused, caption, tiles[0].picture.size))
     moment = "replays" if strips else "first state"
-    return sheet(f"{demo.demo_id}, {moment}; axis {name}, seed {seed}; {', '.join(views)}", tiles)
+    kind = "axes" if "+" in name else "axis"
+    return sheet(f"{demo.demo_id}, {moment}; {kind} {name}, seed {seed}; {', '.join(views)}", tiles)
 
 
-def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
-    if not isinstance(push, DisturbancePerturbation):
+def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
+    """Render the strip of a push that is the only perturbation; empty for others."""
+    push = perturbations[0]
+    if len(perturbations) > 1 or push.acts_until is None:
         return []
     caption = f"without and with {describe(push)}"
     try:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
-from itertools import zip_longest
+from itertools import chain, islice, zip_longest
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,19 +12,19 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from pipeline.axes import TextPerturbation, from_json
+from pipeline.axes import Perturbation, TextPerturbation, from_json
+from pipeline.axes.report_data import KeptPerturbation
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import read_json
-from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
 from pipeline.planning.streams import streams_of
 from pipeline.report import coverage, figures, pages, seen, yields
-from pipeline.report.coverage import AxisPlots, Draw
+from pipeline.report.coverage import AxisPlots
 from pipeline.report.figures import Panel
 from pipeline.report.pages import Clip
-from pipeline.report.sheets import describe
+from pipeline.report.sheets import describe_all, name_episode
 from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
 from pipeline.run.counts import Counts, Rows, by_axis
@@ -95,7 +95,7 @@ def page(run: Run, test: TestSet) -> str:
         previews={folder.name: _pictures(folder) for folder in sorted(run.path(PREVIEWS).glob("*"))},
         versions=_versions(rows),
         example=min(row["episode_id"] for row in kept),
-        settings=_settings(config),
+        settings=_dumped(config),
     )
 
 
@@ -177,20 +177,23 @@ def _worst(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
     row_of_trajectory = {row["trajectory_id"]: row for row in paired}
     moving = [row for row in row_of_trajectory.values() if row["non_target_moved_m"]]
     worst = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
-    return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in worst]
+    return [_video(row, load, f"{name_episode(row)}: {100 * row['non_target_moved_m']:.1f} cm") for row in worst]
 
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
     plots_and_tables = {}
-    changes = ((made.axis, (row, made)) for row in tried for made in from_json(row["perturbations"]))
-    for axis, of_axis in grouped(changes).items():
+    drawn_on: dict[str, list[tuple[Mapping[str, Any], Perturbation]]] = {}
+    for row in tried:
+        for made in from_json(row["perturbations"]):
+            drawn_on.setdefault(made.axis, []).append((row, made))
+    for axis, of_axis in drawn_on.items():
         table = yields.by_level("kept of planned, by component", [row for row, _ in of_axis], axis)
-        draws = []
+        kept = []
         for row, made in of_axis:
             if row["kept"]:
                 resolved = json.loads(row["resolved"]).get(axis)
-                draws.append(Draw(find_task(row["suite"], row["task"]), made, resolved))
-        plots_and_tables[axis] = coverage.plot_axis(axis, draws, test), table
+                kept.append(KeptPerturbation(find_task(row["suite"], row["task"]), made, resolved))
+        plots_and_tables[axis] = coverage.plot_axis(axis, kept, test), table
     return plots_and_tables
 
 
@@ -203,8 +206,8 @@ def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
                 original = find_task(row["suite"], row["task"]).instruction
                 label = f"{made.component.replace('_', ' ')}, level {made.level}"
                 quoted.setdefault(made.component, []).append((label, original, row["instruction"]))
-    dealt = [quote for together in zip_longest(*quoted.values()) for quote in together if quote is not None]
-    return dealt[:REWRITES]
+    dealt = chain.from_iterable(zip_longest(*quoted.values()))
+    return list(islice(filter(None, dealt), REWRITES))
 
 
 def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
@@ -218,7 +221,7 @@ def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
         visible = [row for row in paired if _agent_view(row) != _agent_view(twins[row["twin_id"]])]
         if visible:
             row = min(visible, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
-            caption = "; ".join(describe(made) for made in from_json(row["perturbations"]))
+            caption = f"{name_episode(row)}: {describe_all(from_json(row['perturbations']))}"
             videos.append(_video(row, load, caption))
     return videos
 
@@ -246,16 +249,16 @@ def _versions(rows: Rows) -> dict[str, str]:
     return {**manifest.made_with(rows[0]), "rendered by": "; ".join(devices), "seed": ", ".join(seeds)}
 
 
-class _Settings(yaml.SafeDumper):
+class _ConfigDumper(yaml.SafeDumper):
     """A YAML dumper that writes only the last name of an absolute path, because the page may be published."""
 
 
-_Settings.add_multi_representer(
+_ConfigDumper.add_multi_representer(
     Path, lambda dumper, path: dumper.represent_str(path.name if path.is_absolute() else path.as_posix())
 )
 
 
-def _settings(config: Config) -> str:
+def _dumped(config: Config) -> str:
     # The place of computation changes no result, and would make the pages differ.
     chosen = config.model_dump(exclude_defaults=True, exclude={"compute", "folder"})
-    return yaml.dump(chosen, Dumper=_Settings, sort_keys=False)
+    return yaml.dump(chosen, Dumper=_ConfigDumper, sort_keys=False)

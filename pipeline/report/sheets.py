@@ -11,7 +11,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
-from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.run.counts import by_axis, twins
@@ -22,6 +21,11 @@ GAP_PX = 8
 COLUMNS = 4
 UNSHOWN = {"sha256", "licence", "attribution", "category"}
 """Parameters that captions leave out."""
+
+NO_BREAK = "\N{NO-BREAK SPACE}"
+
+UNITS = {"deg": "°", "m": f"{NO_BREAK}m", "rad": f"{NO_BREAK}rad", "s": f"{NO_BREAK}s", "px": f"{NO_BREAK}px"}
+"""Last part of a parameter's name to the unit that captions write behind its value."""
 
 LONGEST_CAPTION = 10
 """Largest number of lines; further text is left out, and the manifest has all of it."""
@@ -82,15 +86,14 @@ def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
     for episode_id in (row["twin_id"], row["episode_id"]):
         frames = load(episode_id).frames["image"]
         pair.append(decode(frames[_moment(perturbations, len(frames))]))
-    changes = "; ".join(map(describe, perturbations))
-    return Tile(side_by_side(pair, PAIR_SIDE_PX), f"{row['suite']}: {changes}")
+    return Tile(side_by_side(pair, PAIR_SIDE_PX), f"{name_episode(row)}: {describe_all(perturbations)}")
 
 
 def _moment(perturbations: Sequence[Perturbation], steps: int) -> int:
     """Return the step at which an episode of ``steps`` steps is shown."""
-    for push in perturbations:
-        if isinstance(push, DisturbancePerturbation):
-            return min(push.first_step + push.steps, steps - 1)
+    for change in perturbations:
+        if change.acts_until is not None:
+            return min(change.acts_until, steps - 1)
     # The arm is back on the demonstration's path soon after another start.
     return 0 if any(change.layer is Layer.PHYSICS for change in perturbations) else int(MOMENT * steps)
 
@@ -104,29 +107,49 @@ def side_by_side(frames: Sequence[Frame], side_px: int) -> Image.Image:
     return picture
 
 
+def name_episode(row: Mapping[str, Any]) -> str:
+    """Return the suite, the task and the identifier of an episode, which lead from a picture to its data."""
+    return f"{row['suite']}/{row['task']}, episode {row['episode_id']}"
+
+
+def describe_all(perturbations: Sequence[Perturbation]) -> str:
+    """Describe the perturbations of an episode in one line."""
+    return "; ".join(map(describe, perturbations))
+
+
 def describe(perturbation: Perturbation) -> str:
     """Describe a perturbation in one line: component, level and the parameters that are not at their defaults."""
     parameters = perturbation.model_dump(exclude={"axis", "component", "level", "seed"}, exclude_defaults=True)
-    # A no-break space keeps a value with its name; a wording needs no name.
-    values = [f"{name}\N{NO-BREAK SPACE}{value}" for name, value in _flat(parameters)]
-    listed = ", ".join(value.removeprefix("text\N{NO-BREAK SPACE}") for value in values)
-    return f"{perturbation.component}, level {perturbation.level}: {listed}".removesuffix(": ")
+    heading = f"{perturbation.component.replace('_', ' ')}, level {perturbation.level}"
+    return f"{heading}: {', '.join(_describe_parameters(parameters))}".removesuffix(": ")
 
 
-def _flat(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield names and values for captions: nested parameters in one level, numbers rounded."""
+def _describe_parameters(parameters: Mapping[str, Any]) -> Iterator[str]:
+    """Yield each parameter with its value and unit, such as ``yaw -5.2°``; nested parameters in one level."""
     for name, value in parameters.items():
         if isinstance(value, Mapping):
-            yield from _flat(value)
+            yield from _describe_parameters(value)
+        elif name == "text":
+            yield f"“{value}”"
+        elif name == "name":
+            yield str(value)
         elif name not in UNSHOWN:
-            yield name, _shown(value)
+            label, unit = _label_and_unit(name)
+            yield f"{label}{NO_BREAK}{_in_words(value)}{unit}"
 
 
-def _shown(value: Any) -> str:
+def _label_and_unit(name: str) -> tuple[str, str]:
+    label, _, unit = name.rpartition("_")
+    if label and unit in UNITS:
+        return label.replace("_", " "), UNITS[unit]
+    return name.replace("_", " "), ""
+
+
+def _in_words(value: Any) -> str:
     if isinstance(value, Mapping):
-        return " ".join(text for _, text in _flat(value))
+        return " ".join(_describe_parameters(value))
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return " ".join(map(_shown, value))
+        return f"({', '.join(map(_in_words, value))})"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
@@ -165,7 +188,7 @@ def _wrapped(text: str, width_px: int) -> list[str]:
     lines: list[str] = []
     for word in text.split(" "):
         # The font has no glyph for the no-break space.
-        word = word.replace("\N{NO-BREAK SPACE}", " ")
+        word = word.replace(NO_BREAK, " ")
         longer = f"{lines[-1]} {word}" if lines else word
         if lines and _font().getlength(longer) <= width_px:
             lines[-1] = longer

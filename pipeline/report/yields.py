@@ -50,7 +50,7 @@ def wanted_and_kept(targets: Mapping[str, Target]) -> Table:
 def by_suite(tried: Rows) -> Table:
     """Tabulate yields by axis and suite, with totals."""
     suites = named(tried, "suite")
-    head = ("axis", *(suite.removeprefix("libero_") for suite in suites), "all")
+    head = ("axis", *suites, "all")
     lines: list[tuple[str, dict[str, str]]] = [(axis, {"axis": axis}) for axis in named(tried, "axis")]
     body: list[tuple[Cell, ...]] = []
     for name, of in (*lines, ("all", {})):
@@ -85,7 +85,7 @@ def _kept(counts: Counts) -> Cell:
 
 def _by_axis(title: str, rows: Rows, column: str) -> Table:
     counts = tally(rows, column)
-    values = sorted({value for of_axis in counts.values() for value in of_axis})
+    values = sorted(set().union(*counts.values()))
     body: list[tuple[Cell, ...]] = []
     for axis, of_axis in counts.items():
         numbers = [Cell(f"{of_axis[value]:,}" if of_axis[value] else "-") for value in values]

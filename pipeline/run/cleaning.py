@@ -4,13 +4,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from pipeline.export_config import FAILURES
 from pipeline.files import remove
-from pipeline.formats.registry import FAILURES, GROUPS, formats_in
+from pipeline.formats.registry import GROUPS, formats_in
 from pipeline.run.claim import locked, refuse_unmarked
 from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.layout import (
     CARD,
     COUNTS,
+    DATASETS,
     FINETUNE,
     FINISHED,
     FRAMES,
@@ -59,7 +61,7 @@ PARTS = {
     "frames": Part((FRAMES,), "render, from the trajectories: most of a run's time"),
     "trajectories": Part((TRAJECTORIES, REPLAY), "replay, from the demonstrations"),
     "tables": Part(
-        (PLAN, MANIFEST, COUNTS, STATISTICS, LEAKAGE, VALIDATION, INPUTS, SETTINGS, FINISHED),
+        (PLAN, DATASETS, MANIFEST, COUNTS, STATISTICS, LEAKAGE, VALIDATION, INPUTS, SETTINGS, FINISHED),
         "plan, manifest, validate and others",
     ),
 }

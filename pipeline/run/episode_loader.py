@@ -28,13 +28,13 @@ class EpisodeLoader:
     """
 
     data: Path
-    config: RenderConfig
+    render_config: RenderConfig
     extras: tuple[Extra, ...] = ()
     rewrites: Mapping[str, Sequence[str]] | None = None
 
     @cached_property
     def _frames(self) -> FrameStore:
-        return FrameStore(self.data / FRAMES, self.config)
+        return FrameStore(self.data / FRAMES, self.render_config)
 
     def __call__(self, episode_id: str) -> Episode:
         row = _rows_by_id(edition(self.data / PLAN))[episode_id]

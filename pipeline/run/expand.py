@@ -152,7 +152,7 @@ def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> l
         robot = RobotAxis(components=("initial_joints",), initial_norm_rad=START_NORM_RAD)
         axes = Axes(pose=pose, robot=robot)
         tasks = {entry.task for entry in group}
-        episodes = {"pose+robot" if moved else "robot": per_task * len(tasks)}
+        episodes = {"+".join(axes.configured()): per_task * len(tasks)}
         rows += plan.make(group, PlanConfig(seed=seed, axes=axes, episodes=episodes, reserve=RESERVE), REPLAY, test)
     return rows
 

@@ -33,9 +33,10 @@ from pipeline.files import (
 )
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
-from pipeline.identity import PACKAGES, RECIPES, made_with, refuse_unasked
+from pipeline.identity import refuse_unasked
 from pipeline.libero.tasks import find_task
 from pipeline.record import Basis
+from pipeline.run.layout import DATASETS
 from pipeline.run.outcome import shuffled
 from pipeline.run.run import Run
 from pipeline.seeding import digest
@@ -57,13 +58,9 @@ BEFORE = "before"
 def export_run(kind: type[AnyFormat], run: Run) -> None:
     """Bring a run's dataset of one format up to date, and print what was done.
 
-    A dataset that the configuration does not ask for stays as it is; without a record it gets an empty one.
+    A dataset that the configuration does not ask for stays as it is.
     """
-    options = run.config.export.formats.get(kind.name)
-    if options is None:
-        record = run.path(f"{kind.name}.json")
-        if not record.exists():
-            write_json(record, {})
+    if kind.name not in run.config.export.formats:
         print(f"{kind.title} is not asked for: export.{kind.name} is null")
         return
     for target in (*run.formats, *run.failure_formats):
@@ -156,8 +153,8 @@ def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:
     identity = digest(
         "export",
         target.name,
-        RECIPES[target.name],
-        {package: version(package) for package in PACKAGES[target.name]},
+        target.recipe,
+        {package: version(package) for package in target.packages},
         SCHEMA.model_dump(mode="json"),
         _options(target),
         target.extras,
@@ -166,7 +163,7 @@ def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:
     )
     requested = digest(_options(target), target.extras, contents)[:16]
     schema = digest(SCHEMA.model_dump(mode="json"))[:8]
-    return Basis(identity[:16], requested, {**made_with(target.name), "episode schema": schema})
+    return Basis(identity[:16], requested, {**target.made_with(), "episode schema": schema})
 
 
 def _options(target: AnyFormat) -> dict[str, Any]:
@@ -207,6 +204,19 @@ def untouched(target: AnyFormat) -> bool:
         return all((target.folder / name).stat().st_mtime_ns <= recorded for name in target.record().files)
     except (PipelineError, OSError):
         return False
+
+
+def list_records(run: Run) -> None:
+    """Write ``DATASETS``: each record of the requested datasets to its SHA-256, so that DVC depends on one file."""
+    records = [dataset.record_file for dataset in run.recorded_formats if dataset.record_file.exists()]
+    write_json(run.path(DATASETS), {record.relative_to(run.folder).as_posix(): checksum(record) for record in records})
+
+
+def unlist_lost_records(run: Run) -> None:
+    """Delete ``DATASETS`` if it lists a record that is missing, so that DVC starts the exports."""
+    listing = run.path(DATASETS)
+    if listing.exists() and not all(run.path(record).exists() for record in read_json(listing)):
+        listing.unlink()
 
 
 def notice_changes(target: AnyFormat) -> None:

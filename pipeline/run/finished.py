@@ -19,6 +19,7 @@ from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
+from pipeline.formats.registry import FORMATS
 from pipeline.identity import RECIPES, made_with, versions
 from pipeline.record import Basis, Record
 from pipeline.run.export import untouched
@@ -118,6 +119,8 @@ def stage_memory(
         made_with_all = dict(versions())
         for step in RECIPES:
             made_with_all.update(made_with(step))
+        for kind in FORMATS:
+            made_with_all.update(kind.made_with())
     except (PipelineError, PackageNotFoundError):
         # The stage `doctor` reports the fault.
         return Memory(run.folder, name, None, outputs)

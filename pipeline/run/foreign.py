@@ -8,6 +8,7 @@ from pathlib import Path
 from pipeline.axes import AXES
 from pipeline.errors import PipelineError
 from pipeline.files import is_temporary
+from pipeline.formats.registry import FORMATS
 from pipeline.run.layout import CARD, FINETUNE, FRAMES, PREVIEWS, SHEETS, TRAJECTORIES
 from pipeline.stores.store import EARLIER_SUFFIX, SUFFIX, TABLE
 
@@ -26,7 +27,7 @@ CLEARED = {
 
 MADE = {
     **CLEARED,
-    CARD: rf"\.generated\.json|(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
+    CARD: rf"\.generated\.json|({'|'.join(kind.name for kind in FORMATS)})/(README\.md|SHA256SUMS|pictures/{_SHEET})",
     FINETUNE: r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|"
     r"starvla_data_config\.py|openpi_assets/physical-intelligence/libero/norm_stats\.json",
 }

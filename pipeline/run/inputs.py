@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.config import Config
+from pipeline.export_config import ExportConfig
 from pipeline.files import checksum
 from pipeline.libero.tasks import OWN, SUITES, select_tasks
 from pipeline.run.finished import host, settings_of
@@ -48,8 +49,9 @@ def settings(config: Config) -> dict[str, Any]:
     Paths are reduced to their last name, as ``listing`` lists their files.
     """
     sections = {name: settings_of(getattr(config, name)) for name in SECTIONS}
-    export = {"where": None, "lerobot_v21": None, "failures": False, **sections["export"]}
-    return {**sections, "export": export, "host": host()}
+    # Fields that are left out at their default; DVC stops where a parameter is missing.
+    defaults = {name: field.default for name, field in ExportConfig.model_fields.items() if field.exclude_if}
+    return {**sections, "export": {**defaults, **sections["export"]}, "host": host()}
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:

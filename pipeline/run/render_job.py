@@ -34,7 +34,7 @@ class RenderJob:
     streams: tuple[Stream, ...]
     trajectories: Path
     frames: Path
-    config: RenderConfig
+    render_config: RenderConfig
     device: str
 
     def __call__(self) -> None:
@@ -57,7 +57,7 @@ class RenderJob:
             task = find_task(self.row.suite, self.row.task)
             if trajectory.quality is None:  # The replay of a failure stores no quality.
                 trajectory = replace(trajectory, quality=measure(trajectory, task))
-            parts = [*parts, render(trajectory, task, missing, self.config, scene_of_process())]
+            parts = [*parts, render(trajectory, task, missing, self.render_config, scene_of_process())]
         self._save(parts)
 
     def frames_at_most(self) -> int:
@@ -85,11 +85,11 @@ class RenderJob:
     def _stored(self) -> tuple[list[Rendered], list[Stream]]:
         """Read the streams that files hold, and list the streams that no file holds."""
         wanted = {stream.stream_id: stream.geometry.stream_id for stream in self.streams}
-        parts = FrameStore(self.frames, self.config).stored(self.row.trajectory_id, wanted, self.device)
+        parts = FrameStore(self.frames, self.render_config).stored(self.row.trajectory_id, wanted, self.device)
         held: set[str] = set()
         for part in parts:
             held |= {*part.streams, *part.rejected}
         return parts, [stream for stream in self.streams if stream.stream_id not in held]
 
     def _save(self, parts: list[Rendered]) -> None:
-        FrameStore(self.frames, self.config).save(self.row.trajectory_id, merged(parts), self.device)
+        FrameStore(self.frames, self.render_config).save(self.row.trajectory_id, merged(parts), self.device)

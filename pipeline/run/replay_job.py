@@ -33,7 +33,7 @@ class ReplayJob:
     row: Row
     twin: str
     demos: DemosConfig
-    config: ReplayConfig
+    replay_config: ReplayConfig
     folder: Path
 
     def __call__(self) -> Verdict:
@@ -53,13 +53,13 @@ class ReplayJob:
         physics = of_layer(from_json(self.row.perturbations), PhysicsPerturbation)
         environment = shared(demo.task)
         reference = partial(self._reference, environment, demo)
-        start, config = demo, self.config
+        start, replay_config = demo, self.replay_config
         seed = self.row.reset_seed
         if seed is not None:
             # Open-loop actions would succeed by luck, and teach that object positions do not matter.
             start = _at_reset(environment, demo, seed)
-            config = config.model_copy(update={"mode": "tracked"})
-        trajectory = replay(environment, start, self.row.trajectory_id, config, physics, reference)
+            replay_config = replay_config.model_copy(update={"mode": "tracked"})
+        trajectory = replay(environment, start, self.row.trajectory_id, replay_config, physics, reference)
         # Open-loop actions do not work against a push either.
         tracks = seed is not None or trajectory.scene.push is not None
         if tracks and trajectory.verdict.kept and trajectory.mode != "tracked":
@@ -78,12 +78,12 @@ class ReplayJob:
                 return reference
         if demo.states is None:
             # Replay the recorded hand motion, which began before anything settled.
-            unsettled = self.config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
+            unsettled = self.replay_config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
             return _followed(replay(environment, demo, self.row.trajectory_id, unsettled))
-        mask = kept_actions(demo.actions, self.config.noops)
+        mask = kept_actions(demo.actions, self.replay_config.noops)
         # The state after the last action is not recorded: assume that the hand rests.
         states = np.vstack([demo.states[mask], demo.states[-1:]])
-        model_xml = demo.model_xml or environment.place_fixtures(self.config.fixture_seed)
+        model_xml = demo.model_xml or environment.place_fixtures(self.replay_config.fixture_seed)
         return Reference.of(model_xml, states, demo.actions[mask])
 
     def limit_s(self) -> float:

@@ -22,13 +22,13 @@ class Replays:
 
     Attributes:
         demos: the section ``demos``.
-        config: the section ``replay``.
+        replay_config: the section ``replay``.
         store: store of the trajectories.
         limits: the section ``filter``.
     """
 
     demos: DemosConfig
-    config: ReplayConfig
+    replay_config: ReplayConfig
     store: TrajectoryStore
     workers: Workers
     limits: FilterConfig = NO_LIMITS
@@ -69,7 +69,8 @@ class Replays:
         twin_of = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
         # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
         in_turn = sorted(map(row_of.__getitem__, missing), key=lambda row: row.demo_id)
-        jobs = [ReplayJob(row, twin_of[row.demo_id], self.demos, self.config, self.store.root) for row in in_turn]
+        where = self.demos, self.replay_config, self.store.root
+        jobs = [ReplayJob(row, twin_of[row.demo_id], *where) for row in in_turn]
         self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
 
 

@@ -10,7 +10,6 @@ from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Format
-from pipeline.formats.registry import failures_of, formats_of, recorded
 from pipeline.planning import plan
 from pipeline.run import manifest, outcome
 from pipeline.run.episode_loader import EpisodeLoader
@@ -107,7 +106,7 @@ class Run:
     @property
     def formats(self) -> list[AnyFormat]:
         """Datasets that the configuration asks for."""
-        return formats_of(self.folder, self.config.export, self.config.render.extras)
+        return self.config.export.datasets(self.folder, self.config.render.extras)
 
     def dataset(self, name: str) -> AnyFormat:
         """Return the dataset of a format that the configuration asks for, such as ``rlds``."""
@@ -117,12 +116,13 @@ class Run:
     @property
     def failure_formats(self) -> list[AnyFormat]:
         """Datasets of failures that the configuration asks for."""
-        return failures_of(self.folder, self.config.export, self.config.render.extras)
+        return self.config.export.failure_datasets(self.folder, self.config.render.extras)
 
     @property
     def recorded_formats(self) -> list[AnyFormat]:
         """Datasets that the configuration asks for; datasets of failures only if they exist."""
-        return recorded(self.folder, self.config.export, self.config.render.extras)
+        recorded_failures = [dataset for dataset in self.failure_formats if dataset.record_file.exists()]
+        return [*self.formats, *recorded_failures]
 
     def episodes(
         self, extras: tuple[Extra, ...] = (), rewrites: Mapping[str, Sequence[str]] | None = None

@@ -3,8 +3,9 @@
 import itertools
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -80,6 +81,11 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
             resolved={**scene.resolved, "layout": resolved},
         )
     raise RefusedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
+
+
+def added_names(resolved: Mapping[str, Any]) -> list[str]:
+    """List the catalogue's names of the objects that were added to a scene, by its ``resolved``, in their order."""
+    return [placed["name"] for placed in resolved.get("layout", {}).get("objects", [])]
 
 
 def added_objects(model: mujoco.MjModel) -> list[str]:

@@ -21,7 +21,7 @@ from pipeline.identity import MAPS_RECIPE
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import SUFFIX, Store
-from pipeline.types import Geometry, Quality, Rendered
+from pipeline.types import Geometry, Jpeg, Quality, Rendered
 
 _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 """Parts of the schema that describe the content of a store's files."""
@@ -51,7 +51,7 @@ class FrameStore(Store):
     ``streams`` (ids of the rendered streams) and ``rejected`` (JSON, id of each rejected stream to the reason). A
     file's name is ``<trajectory id>/<digest of its streams>``.
 
-    Frames that were encoded with another ``config`` count as missing.
+    Frames that were encoded with another ``render_config`` count as missing.
     """
 
     step, stage, pattern = "encoding", "render", f"*/*{SUFFIX}"
@@ -63,10 +63,10 @@ class FrameStore(Store):
         "rejected": pa.string(),
     }
 
-    def __init__(self, root: Path, config: RenderConfig):
+    def __init__(self, root: Path, render_config: RenderConfig):
         schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*config.extras} else {}
-        super().__init__(root, config.model_dump(mode="json"), {"episode schema": schema, **maps})
+        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*render_config.extras} else {}
+        super().__init__(root, render_config.model_dump(mode="json"), {"episode schema": schema, **maps})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def merged(parts: Sequence[Rendered]) -> Rendered:
     that a worker was lost has no states.
     """
     shared = next((part for part in parts if part.streams), parts[0])
-    streams: dict[str, Sequence[bytes]] = {}
+    streams: dict[str, Sequence[Jpeg]] = {}
     rejected: dict[str, str] = {}
     geometry: dict[str, Geometry] = {}
     for part in parts:
@@ -227,7 +227,7 @@ def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[s
         state=file.array("state"),
         joint_state=file.array("joint_state"),
         action=file.array("action"),
-        streams={name: _frames(file, f"streams/{name}") for name in streams},
+        streams={name: [*map(Jpeg, _unpacked(file, f"streams/{name}"))] for name in streams},
         rejected=json.loads(file.attributes["rejected"]),
         geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
         object_poses=file.array("object_poses") if "object_poses" in file.checksums else None,
@@ -249,11 +249,12 @@ def _packed(parent: str, files: Sequence[bytes]) -> dict[str, NDArray[Any]]:
 
 def _geometry(file: SealedFile, view: str) -> Geometry:
     matrices = {name: file.array(f"{view}/{name}") for name in MATRICES}
-    maps = {name: _frames(file, f"{view}/{name}") for name in MAPS if f"{view}/{name}/bytes" in file.checksums}
+    maps = {name: _unpacked(file, f"{view}/{name}") for name in MAPS if f"{view}/{name}/bytes" in file.checksums}
     return Geometry(**matrices, maps=maps)
 
 
-def _frames(file: SealedFile, stream: str) -> list[bytes]:
-    packed = file.array(f"{stream}/bytes").tobytes()
-    ends = file.array(f"{stream}/ends").tolist()
+def _unpacked(file: SealedFile, parent: str) -> list[bytes]:
+    """Split the images that ``_packed`` joined."""
+    packed = file.array(f"{parent}/bytes").tobytes()
+    ends = file.array(f"{parent}/ends").tolist()
     return [packed[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]

@@ -32,7 +32,7 @@ _BASE_CLASS = re.compile(r"libero_\w*?_manipulation")
 _SCENE_FILE = re.compile(r".*_table_(?P<surface>.+?)(?:_bg_(?P<wall>.+))?\.xml")
 _NOISE = {
     "motion": ("motion_blur", ("radius_px", "sigma_px")),
-    "gaussian": ("gaussian_blur", ("sigma_px",)),
+    "gaussian_blur": ("gaussian_blur", ("sigma_px",)),
     "zoom": ("zoom_blur", ("max_scale", "copies")),
     "fog": ("fog", ("density", "roughness_decay")),
     "glass": ("glass_blur", ("sigma_px", "delta_px", "passes")),
@@ -84,13 +84,13 @@ class Reader:
         return next(ast.literal_eval(node.value) for node in assignments if ast.unparse(node.targets[0]) == name)
 
     def _read_classes(self) -> Iterator[tuple[str, dict[str, str]]]:
-        """Yield the name of every scene's class, in lower case as the benchmark looks it up, and its settings."""
+        """Yield the name of every scene's class, in lower case as the benchmark looks it up, and its styles."""
         for arena in ("tabletop", "kitchen_tabletop", "living_room_tabletop", "study_tabletop", "floor"):
             source = self._text(f"envs/problems/libero_{arena}_manipulation.py")
             _, *parts = re.split(r"^class (\w+)\(", source, flags=re.MULTILINE)
             for name, body in zip(parts[::2], parts[1::2], strict=True):
-                settings = re.findall(r'"(scene_xml|floor_style|wall_style)": "([^"]+)"', body)
-                yield name.lower(), dict(settings)
+                styles = re.findall(r'"(scene_xml|floor_style|wall_style)": "([^"]+)"', body)
+                yield name.lower(), dict(styles)
 
     def change(self, suite: str, name: str) -> tuple[str, str, str, str, dict[str, Value]]:
         """Return the fields of a ``TestTask`` after ``suite``.
@@ -131,11 +131,11 @@ class Reader:
         return base.name, name, "background", component, self._textures(problem, component == "theme")
 
     def scene_files(self, suite: str, name: str) -> SceneFiles:
-        """Return the files of a task's arena; settings that its class lacks come from the class of the arena."""
+        """Return the files of a task's arena; styles that its class lacks come from the class of the arena."""
         problem, _ = self._heading(suite, name)
-        settings = self._classes[_BASE_CLASS.match(problem)[0]] | self._classes[problem]  # type: ignore[index]
-        floor, wall = self._floors[settings["floor_style"]], self._walls[settings["wall_style"]]
-        return SceneFiles(settings["scene_xml"], f"textures/{floor}", f"textures/{wall}")
+        styles = self._classes[_BASE_CLASS.match(problem)[0]] | self._classes[problem]  # type: ignore[index]
+        floor, wall = self._floors[styles["floor_style"]], self._walls[styles["wall_style"]]
+        return SceneFiles(styles["scene_xml"], f"textures/{floor}", f"textures/{wall}")
 
     @cached_property
     def object_models(self) -> dict[str, str]:
@@ -168,18 +168,18 @@ class Reader:
         Tables get their image from a scene file that is named after the image. In the floor arena, the working surface
         is the floor itself. In the kitchen and the living room, only the scene files state the image of the wall.
         """
-        settings = self._classes[problem]
-        scene_file = _SCENE_FILE.fullmatch(settings.get("scene_xml", ""))
+        styles = self._classes[problem]
+        scene_file = _SCENE_FILE.fullmatch(styles.get("scene_xml", ""))
         wall = None
         if scene_file:
             surface = f"{scene_file['surface']}.png"
             if scene_file["wall"]:
                 wall = f"{scene_file['wall']}.png"
         else:
-            surface = self._floors[settings["floor_style"]]
+            surface = self._floors[styles["floor_style"]]
         files: dict[str, Value] = {"arena": bddl.arena(problem), "surface": surface}
         if theme:
-            files["wall"] = wall or self._walls[settings["wall_style"]]
+            files["wall"] = wall or self._walls[styles["wall_style"]]
         return files
 
 

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,11 @@ import tensorflow_datasets as tfds
 
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
-from pipeline.axes.camera_pose import moved_to
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.formats.lerobot_columns import EPISODE_ID, camera_column
+from pipeline.formats.lerobot.columns import EPISODE_ID, camera_column
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
@@ -35,6 +35,7 @@ from pipeline.planning.leakage import check as compare
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TESTED_SUITES, TestSet
 from pipeline.types import Floats, Task
+from pipeline.validation.camera_pose import moved_to
 
 LABELS = ("suite", "task", "perturbations")
 
@@ -212,7 +213,7 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
     """Describe an episode in the axes' parameters, as far as it shows them, or else by its labels."""
     perturbations = [p for p in _labels(episode) if task is not None or not _needs_task(p)]
     if episode.extrinsics is not None:
-        perturbations = [p for p in perturbations if p.axis != "camera"]
+        perturbations = [p for p in perturbations if AXES[p.axis].audited != "cameras"]
         arenas = list(ARENAS) if task is None else [bddl.read(task.bddl_file).arena]
         cameras = [moved_to(episode.extrinsics, arena) for arena in arenas]
         if None not in cameras:
@@ -224,15 +225,15 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
         rewrites = [LanguagePerturbation(component="paraphrase", level=1, text=text)]
     if task is None:
         # Without a task, the episode is compared with the task whose test instructions are nearest.
-        every = [task for suite in TESTED_SUITES for task in tasks(suite)]
+        every = list(chain.from_iterable(map(tasks, TESTED_SUITES)))
         task = min(every, key=lambda task: rewrites[0].nearest(test, task).distance) if rewrites else every[0]
     return Compared(episode.episode_id, task.suite, task.name, to_json([*perturbations, *rewrites]))
 
 
 def _labels(episode: StoredEpisode) -> list[Perturbation]:
-    """Return the labels of an episode except language, which its instruction shows."""
+    """Return the labels of an episode except those that its instruction shows."""
     labels = () if episode.perturbations is None else from_json(episode.perturbations)
-    return [p for p in labels if p.axis != "language"]
+    return [p for p in labels if AXES[p.axis].audited != "instructions"]
 
 
 def _needs_task(perturbation: Perturbation) -> bool:
@@ -257,7 +258,7 @@ def _tasks_by_text() -> dict[str, Task]:
     bank = load_bank()
     for suite in TESTED_SUITES:
         for task in tasks(suite):
-            rewrites = [text for texts in bank.get(suite, {}).get(task.name, {}).values() for text in texts]
+            rewrites = chain.from_iterable(bank.get(suite, {}).get(task.name, {}).values())
             for text in (*rewrites, task.instruction):
                 by_text[normalise(text)] = task
     return by_text

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
-from pipeline.formats.lerobot_statistics import FIGURES, complete, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.formats.read_back import Copy, Fault
+from pipeline.formats.stated_statistics import FIGURES, complete, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.types import Frame

@@ -141,10 +141,10 @@ class _FileJob:
     def _missing(self, entries: Sequence[DemoEntry], reasons: Mapping[DemoEntry, str]) -> Iterator[str]:
         """Report each demonstration of a file whose replays all miss, with dropped no-ops and settings that help."""
         working = []
-        for settings in _other_settings(self.replay):
-            kept = sum(reason == "kept" for reason in self._replayed(entries, settings).values())
+        for changed in _changed_replays(self.replay):
+            kept = sum(reason == "kept" for reason in self._replayed(entries, changed).values())
             if kept:
-                working.append(f"{_in_words(settings)} ({kept} of {len(entries)} reach the goal)")
+                working.append(f"{_in_words(changed)} ({kept} of {len(entries)} reach the goal)")
         if working:
             expected = "settings of the run under which the demonstrations reach their goal"
             remedy = f"set {'; or '.join(working)}"
@@ -201,16 +201,16 @@ def _is_refused(reason: str) -> bool:
     return reason != "kept" and reason not in MISSED
 
 
-def _other_settings(replay: ReplayConfig) -> Iterator[ReplayConfig]:
+def _changed_replays(replay: ReplayConfig) -> Iterator[ReplayConfig]:
     """Yield other settings for a run: keep all no-ops, track if open-loop replay fails, and both."""
     changes: list[dict[str, object]] = [{"noops": "keep"}, {"mode": "auto"}, {"noops": "keep", "mode": "auto"}]
     tried = {replay}
     for change in changes:
-        settings = replay.model_copy(update=change)
+        changed = replay.model_copy(update=change)
         # If open-loop replay fails, auto tracks, which was tried already.
-        if settings not in tried and not (replay.mode == "tracked" and settings.mode == "auto"):
-            tried.add(settings)
-            yield settings
+        if changed not in tried and not (replay.mode == "tracked" and changed.mode == "auto"):
+            tried.add(changed)
+            yield changed
 
 
 def _in_words(replay: ReplayConfig) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, PackagePath, distribution, metadata, requires, version
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from platform import python_version
 from typing import Literal
@@ -223,7 +224,7 @@ def _ffmpeg() -> Diagnosis:
 
 def _assets() -> Diagnosis:
     try:
-        files = [file for name in ASSET_PACKAGES for file in distribution(name).files or []]
+        files = list(chain.from_iterable(distribution(name).files or [] for name in ASSET_PACKAGES))
     except PackageNotFoundError as error:
         return Diagnosis("LIBERO assets", "fail", f"{error.name} is not installed", REINSTALL)
     lost = [file for file in files if not Path(str(file.locate())).exists()]

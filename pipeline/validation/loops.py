@@ -1,6 +1,7 @@
-"""Compilation of all Numba loops that a run uses, robosuite's and ours: python -m pipeline.validation.loops
+"""Compilation of all Numba loops that a run uses, robosuite's and ours.
 
-``setup.sh`` runs it once. Otherwise the processes that first need a loop compile it, several at a time.
+``setup.sh`` calls ``python -m pipeline.validation.loops`` once. Otherwise the processes that first need a loop
+compile it, several at a time.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ def compile_all() -> None:
     trial()
     frame = np.zeros(SCHEMA.frame.shape, np.uint8)
     axis = NoiseAxis()
-    for levels in (axis.motion, axis.gaussian, axis.zoom, axis.fog, axis.glass):
+    for levels in (axis.motion, axis.gaussian_blur, axis.zoom, axis.fog, axis.glass):
         levels[0].apply(frame, seeding.rng("loops"))
     distance("one wording", "another")
 

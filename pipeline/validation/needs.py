@@ -12,7 +12,8 @@ less time than estimated.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +26,6 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN
 from pipeline.formats.base import StepSizes
-from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
@@ -73,8 +73,8 @@ def needed_mb(config: Config) -> dict[str, float]:
     for number, kinds in _planned(config.plan):
         physics = any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         trajectories += number * (1 + config.plan.reserve) * physics
-        frames += number * len({view for kind in kinds for view in kind.views})
-        maps += number * len({view for kind in kinds if _seen_otherwise(kind) for view in kind.views})
+        frames += number * _changed_views(kinds)
+        maps += number * _changed_views([kind for kind in kinds if _seen_otherwise(kind)])
     frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
     map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
     poses_kb = POSES_KB if "object_poses" in extras else 0.0
@@ -86,7 +86,7 @@ def needed_mb(config: Config) -> dict[str, float]:
         + amounts.steps * (poses_kb + MOTION_KB),
     }
     sizes = StepSizes(frame_kb, map_kb, poses_kb, MOTION_KB)
-    for dataset in formats_of(config.data, config.export, extras):
+    for dataset in config.export.datasets(config.data, extras):
         needed_kb[dataset.name] = steps * dataset.step_kb(sizes) + episodes * EPISODE_KB
     return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
 
@@ -121,7 +121,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
             rendered_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + maps_s * mapped)
             encoded_s += episodes * amounts.mean_steps * ENCODE_S * bool(here)
     processor = speed.step_s / REFERENCE.step_s
-    datasets = formats_of(config.data, config.export, config.render.extras)
+    datasets = config.export.datasets(config.data, config.render.extras)
     _, exported_steps = _exported(config, amounts)
     return {
         "replay": trajectories * replay_s(amounts.mean_steps, speed),
@@ -194,6 +194,11 @@ def _planned(plan: PlanConfig) -> Iterator[tuple[int, list[type[Perturbation]]]]
     """Yield, for each combination of axes, its wanted number of episodes, and the classes of its perturbations."""
     for name, episodes in plan.episodes.items():
         yield episodes, [AXES[axis].draws[0] for axis in axes_of(name)]
+
+
+def _changed_views(kinds: Iterable[type[Perturbation]]) -> int:
+    """Count the views that show at least one of the perturbations."""
+    return len(set(chain.from_iterable(kind.views for kind in kinds)))
 
 
 def _casts_shadows(kind: type[Perturbation]) -> bool:

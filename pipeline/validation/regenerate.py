@@ -1,6 +1,6 @@
 """Rebuilding of one episode from its row of the manifest and the demonstration, and comparison with the dataset.
 
-`python -m pipeline regenerate EPISODE_ID CONFIG --out FOLDER`
+`python -m pipeline dataset regenerate EPISODE_ID CONFIG --out FOLDER`
 """
 
 from collections.abc import Mapping
@@ -16,10 +16,9 @@ from pipeline import gl
 from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
-from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Row
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
 from pipeline.planning import plan

@@ -37,7 +37,7 @@ def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(chosen.values())
 
 
-def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fault]:
+def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iterator[Fault]:
     """Compare the first and the middle frame of every view with fresh renderings, which numpy rotates.
 
     If the same device renders, the stored frame must be the same file. On another device, and in the datasets, the
@@ -50,7 +50,7 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
         for view in SCHEMA.views:
             name = f"{view} of step {step}"
             stored = case.made.frames[view][step]
-            again = encode(_turned(fresh[view]), config)
+            again = encode(_turned(fresh[view]), render_config.jpeg_quality)
             same = exact and stored == again
             for seen in case.seen:
                 if seen.view != view or (same and seen.dataset == "frames"):

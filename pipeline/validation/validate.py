@@ -9,6 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import chain
 from operator import call
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 from pipeline.clients import oft
 from pipeline.compute.pool import Workers
 from pipeline.errors import PipelineError
+from pipeline.export_config import FAILURES
 from pipeline.files import read_json, scratch
 from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
@@ -97,7 +99,7 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
                     if episode_id in missed:
                         failed[episode_id] = row | places.get(episode_id, {})
                 job = EpisodesJob(run, failures, cache, frozenset([*failed][:1]), ("outcome",))
-                total.add(_datasets(job, failed, workers), within=f"{registry.FAILURES}/")
+                total.add(_datasets(job, failed, workers), within=f"{FAILURES}/")
         finally:
             scene_of_process().close()
     report = {}
@@ -109,7 +111,7 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
 def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
     """Check datasets, each as a whole, and their episodes; ``job`` has all datasets."""
     total = Results()
-    files = [file for dataset in job.formats for file in dataset.written()]
+    files = list(chain.from_iterable(dataset.written() for dataset in job.formats))
     for faults in workers(Written.faults, files, "checksums"):
         total.note("checksums", faults)
     # Datasets with changed files are not checked further, as their content may be anything.
@@ -197,8 +199,8 @@ def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[F
     by_trajectory = grouped((row["trajectory_id"], row) for row in rows if row["episode_id"] in again)
     others = [row for row in rows if row["episode_id"] not in again]
     # LeRobot's files are the largest, so they decide first: the next episode is in a file that is open already.
-    columns = [column.name for dataset in reversed(formats) for column in dataset.columns]
-    others.sort(key=lambda row: [(row[column] is None, row[column]) for column in columns])
+    columns = list(chain.from_iterable(dataset.columns for dataset in reversed(formats)))
+    others.sort(key=lambda row: [(row[column.name] is None, row[column.name]) for column in columns])
     return [*by_trajectory.values(), *(others[start : start + SLICE] for start in range(0, len(others), SLICE))]
 
 

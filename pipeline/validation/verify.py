@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 from pipeline.compute.pool import Workers
@@ -66,7 +67,7 @@ def _readers(run: Run) -> list[Callable[[], object]]:
         partial(plan.read, run.plan_file),
         partial(manifest.read, run.manifest_file),
     ]
-    names = [COUNTS, LEAKAGE, *([STATISTICS] if run.config.export.rlds else [])]
+    names = [COUNTS, LEAKAGE, *([STATISTICS] if "rlds" in run.config.export.formats else [])]
     return [*readers, *(partial(read_json, run.path(name)) for name in names)]
 
 
@@ -91,4 +92,4 @@ def _damaged(store: Store, file: str) -> list[str]:
 def _result(findings: Iterable[Sequence[str]]) -> dict[str, Any]:
     """Summarize the findings of each checked file."""
     of_files = list(findings)
-    return {"checked": len(of_files), "damaged": [finding for of_file in of_files for finding in of_file]}
+    return {"checked": len(of_files), "damaged": list(chain.from_iterable(of_files))}

@@ -1,6 +1,7 @@
 """Camera: the benchmark's own formulas, by an independent implementation, and clear of its test cameras."""
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -15,10 +16,14 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import from_json, to_json
 from pipeline.axes.camera import CameraAxis, CameraPerturbation
 from pipeline.axes.noise import NoiseAxis
+from pipeline.errors import PipelineError
+from pipeline.libero.tasks import tasks
 from pipeline.planning import leakage
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.types import Task
 
+OF_LIBERO_90 = tasks("libero_90")[0]
 TABLETOP_POS_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
 TABLETOP_QUAT_WXYZ = np.array([0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349])
 NOMINAL_RAYS_M = {
@@ -52,12 +57,12 @@ def whole(parameters: Mapping[str, float]) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def test_set() -> TestSet:
-    tasks = [
+    test_tasks = [
         TestTask("libero_goal", "base", f"base_{n}", "camera", component, whole(parameters))
         for n, (component, parameters) in enumerate(benchmark_cameras())
         if parameters != {"azimuth_deg": 0, "elevation_deg": 0}  # H = 0 is in the grid at 15 degrees only
     ]
-    return TestSet(tuple(tasks))
+    return TestSet(tuple(test_tasks))
 
 
 def benchmark_pose(
@@ -107,8 +112,8 @@ def test_directions_mean_what_the_docstrings_say() -> None:
     assert looks(pitched)[2] < looks(TABLETOP_QUAT_WXYZ)[2]
 
 
-def draws(axis: CameraAxis, count: int = 1000) -> list[CameraPerturbation]:
-    return [axis.sample(rng(1, "camera", "demo", variant), MILK, variant) for variant in range(count)]
+def draws(axis: CameraAxis, count: int = 1000, task: Task = MILK) -> list[CameraPerturbation]:
+    return [axis.sample(rng(1, "camera", "demo", variant), task, variant) for variant in range(count)]
 
 
 def test_draws_are_keyed_and_cover_every_component_and_level() -> None:
@@ -120,9 +125,6 @@ def test_draws_are_keyed_and_cover_every_component_and_level() -> None:
 
 def test_the_level_is_the_strength_of_what_the_component_is_about() -> None:
     axis = CameraAxis()
-    assert axis.distance is not None
-    assert axis.spherical is not None
-    assert axis.orientation is not None
     for p in draws(axis):
         by_level, strength = {
             "distance": (axis.distance.distance_scale, p.distance_scale),
@@ -142,7 +144,8 @@ def test_beside_its_component_a_draw_changes_one_thing_a_little() -> None:
         # Of a spherical draw the elevation itself may be what is off the test set's.
         assert sum(aside.values()) == 1 or (p.component == "spherical" and not any(aside.values())), p
         assert p.component == "spherical" or p.azimuth_deg == 0
-        assert p.component == "distance" or 0.87 <= p.distance_scale <= 1.18
+        assert p.component == "distance" or p.distance_scale == 1 or 1.094 <= p.distance_scale <= 1.18
+        assert -2 <= p.elevation_deg <= 17
         assert p.component == "orientation" or np.hypot(p.yaw_deg, p.pitch_deg) <= 8.001
 
 
@@ -156,10 +159,65 @@ def test_no_side_is_preferred() -> None:
 
 
 def test_levels_and_components_can_be_chosen() -> None:
-    axis = CameraAxis(levels=(2, 5), distance=None, orientation=None)
+    axis = CameraAxis(levels=(2, 5), components=("spherical",))
     assert {(p.component, p.level) for p in draws(axis, 50)} == {("spherical", 2), ("spherical", 5)}
+    with pytest.raises(ValidationError, match="components"):
+        CameraAxis(components=())
+
+
+def test_a_component_that_is_null_is_left_out_as_before() -> None:
+    """Configurations of earlier versions."""
+    written = CameraAxis.model_validate({"distance": None, "orientation": None, "levels": [2]})
+    assert written == CameraAxis(components=("spherical",), levels=(2,))
     with pytest.raises(ValidationError, match="at least one of distance"):
-        CameraAxis(distance=None, spherical=None, orientation=None)
+        CameraAxis.model_validate({"distance": None, "components": ["distance"]})
+
+
+@pytest.mark.parametrize("clear_by", ["second_change", "resample", "off"])
+@pytest.mark.parametrize("task", [MILK, OF_LIBERO_90], ids=["tested suite", "LIBERO-90"])
+def test_no_configured_range_is_left(task: Task, clear_by: str) -> None:
+    """A low camera near the front: the second change leaves distance and turn, which are not among the components."""
+    spherical = {"elevation_deg": [[0, 5]], "azimuth_deg": [[[-10, 10]]] * 5}
+    settings = {"components": ["spherical"], "spherical": spherical, "clear_by": clear_by}
+    axis = CameraAxis.model_validate(settings)
+    for p in draws(axis, task=task):
+        assert 0 <= p.elevation_deg <= 5
+        assert abs(p.azimuth_deg) <= 10
+        assert (p.distance_scale, p.yaw_deg, p.pitch_deg) == (1, 0, 0)
+
+
+def test_a_second_change_is_within_the_ranges_of_its_component() -> None:
+    settings = {
+        "distance": {"distance_scale": [[[1.0, 1.1]]] * 5},
+        "spherical": {"elevation_deg": [[2, 6]]},
+        "orientation": {"turn_deg": [[[0, 6]]] * 5},
+    }
+    drawn = draws(CameraAxis.model_validate(settings))
+    for p in drawn:
+        assert 1 <= p.distance_scale <= 1.1
+        assert 2 <= p.elevation_deg <= 6 or (p.component != "spherical" and p.elevation_deg == 0)
+        assert 0 <= max(p.yaw_deg, p.pitch_deg, key=abs) <= 6
+    changed = Counter((p.component, p.distance_scale != 1, bool(p.yaw_deg)) for p in drawn)
+    assert changed["spherical", True, False] > 50
+    assert changed["spherical", False, True] > 50
+
+
+def test_only_tasks_of_tested_suites_get_a_second_change(test_set: TestSet) -> None:
+    for p in draws(CameraAxis(), task=OF_LIBERO_90):
+        parts = (p.azimuth_deg or p.elevation_deg, p.distance_scale - 1, p.yaw_deg or p.pitch_deg)
+        assert sum(part != 0 for part in parts) == 1, p
+        assert p.nearest(test_set, OF_LIBERO_90) == (np.inf, 0)
+
+
+def test_ranges_without_a_clear_camera_are_rejected(test_set: TestSet) -> None:
+    CameraAxis().refuse_tested(test_set, MILK)
+    near = CameraAxis.model_validate({"components": ["orientation"], "levels": [2, 5]})
+    with pytest.raises(PipelineError, match=r"no orientation camera of level 2, 5 .* 5 degrees(?s:.*)clear_by: off"):
+        near.refuse_tested(test_set, MILK)
+    near.refuse_tested(test_set, OF_LIBERO_90)
+    near.model_copy(update={"clear_by": "off"}).refuse_tested(test_set, MILK)
+    low = {"components": ["spherical"], "spherical": {"elevation_deg": [[5.1, 9.9]]}, "clear_by": "resample"}
+    CameraAxis.model_validate(low).refuse_tested(test_set, MILK)
 
 
 def test_default_draws_are_mostly_clear_of_every_test_camera(test_set: TestSet) -> None:

@@ -138,7 +138,7 @@ def test_every_class_comes_first_for_some_task() -> None:
 
 
 def test_only_configured_classes_are_drawn(task: Task) -> None:
-    axis = LanguageAxis(classes=("paraphrase", "common_sense"))
+    axis = LanguageAxis(components=("paraphrase", "common_sense"))
     assert {draw(task, variant, axis).component for variant in range(8)} == {"paraphrase", "common_sense"}
 
 
@@ -169,15 +169,17 @@ def test_rewrite_equal_to_the_instruction_is_refused() -> None:
 
 def test_no_classes_is_refused() -> None:
     with pytest.raises(ValidationError):
-        LanguageAxis(classes=())
+        LanguageAxis(components=())
+    former = LanguageAxis.model_validate({"classes": ["paraphrase"]})
+    assert former == LanguageAxis(components=("paraphrase",))
 
 
 def test_among_more_objects_things_are_called_by_their_names() -> None:
     axis = LanguageAxis(levels=(1, 2)).beside(["layout", "language"])
-    assert axis == LanguageAxis(levels=(1, 2), classes=NAMED)
-    assert LanguageAxis(classes=("paraphrase", "common_sense")).beside(["layout"]).classes == ("paraphrase",)
+    assert axis == LanguageAxis(levels=(1, 2), components=NAMED)
+    assert LanguageAxis(components=("paraphrase", "common_sense")).beside(["layout"]).components == ("paraphrase",)
     with pytest.raises(ValueError, match="distraction or paraphrase"):
-        LanguageAxis(classes=("common_sense", "reasoning_chain")).beside(["layout"])
+        LanguageAxis(components=("common_sense", "reasoning_chain")).beside(["layout"])
 
 
 def test_levels_follow_the_distance_to_the_original(task: Task) -> None:

@@ -1,5 +1,6 @@
 """Each corruption equals an independent implementation of it, and its draws are keyed and off the test grid."""
 
+import json
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,6 +16,7 @@ from scipy.ndimage import zoom
 from skimage.filters import gaussian
 
 from pipeline import seeding
+from pipeline.axes import from_json, to_json
 from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.axes.noise import Effect, NoiseAxis, NoisePerturbation
 from pipeline.evaluation import libero_plus
@@ -26,14 +28,14 @@ Image = NDArray[np.floating]
 Reference = Callable[[Frame, float, float, float], Frame]
 
 AXIS = NoiseAxis()
-COMPONENTS = ("motion", "gaussian", "zoom", "fog", "glass")
+COMPONENTS = ("motion", "gaussian_blur", "zoom", "fog", "glass")
 STOCHASTIC = ("motion", "fog", "glass")
 TASK = Task("libero_goal", "open_the_middle_drawer", "open the middle drawer", Path("open_the_middle_drawer.bddl"))
 
 # LIBERO-Plus's ten severities, weakest first, in the benchmark's own parameters.
 TEST_GRID: dict[str, list[tuple[float, ...]]] = {
     "motion": [(5, 2), (8, 3), (10, 4), (12, 5), (15, 6), (18, 8), (20, 10), (25, 12), (30, 15), (35, 20)],
-    "gaussian": [(1,), (2,), (3,), (4,), (5,), (6,), (7,), (8,), (9,), (10,)],
+    "gaussian_blur": [(1,), (2,), (3,), (4,), (5,), (6,), (7,), (8,), (9,), (10,)],
     "zoom": [
         (1.11, 0.01), (1.16, 0.01), (1.21, 0.02), (1.26, 0.02), (1.31, 0.03),
         (1.36, 0.01), (1.41, 0.01), (1.46, 0.02), (1.51, 0.02), (1.56, 0.03),
@@ -101,7 +103,7 @@ def test_motion_equals_imagemagick_within_one_grey_level(effect: Motion, key: in
     assert difference(effect.apply(frame, seeding.rng(key)), expected) <= 1
 
 
-@pytest.mark.parametrize("effect", AXIS.gaussian, ids=repr)
+@pytest.mark.parametrize("effect", AXIS.gaussian_blur, ids=repr)
 def test_gaussian_equals_scikit_image(effect: Gaussian) -> None:
     frame = make_frame(72, 96)
     expected = to_frame(gaussian(frame / 255, effect.sigma_px, channel_axis=-1))
@@ -201,7 +203,7 @@ def as_the_benchmark(component: str, row: tuple[float, ...], frame: Frame, key: 
     match component:
         case "motion":
             return motion_blur(frame, row[0], row[1], rng.uniform(-45, 45))
-        case "gaussian":
+        case "gaussian_blur":
             return to_frame(gaussian(frame / 255, row[0], channel_axis=-1))
         case "zoom":
             return zoomed(frame, np.arange(1, row[0], row[1], dtype=float))
@@ -319,7 +321,10 @@ def perturbation(effect: Effect) -> NoisePerturbation:
 def test_distance_counts_in_steps_between_severities(effect: Effect, steps: float, test: TestSet) -> None:
     nearest = perturbation(effect).nearest(test, TASK)
     assert nearest.distance == pytest.approx(steps)
-    assert nearest.compared == {"motion": 336, "gaussian": 341, "zoom": 288, "fog": 272, "glass": 364}[effect.component]
+    assert (
+        nearest.compared
+        == {"motion": 336, "gaussian_blur": 341, "zoom": 288, "fog": 272, "glass": 364}[effect.component]
+    )
 
 
 @pytest.mark.parametrize("component", COMPONENTS)
@@ -335,6 +340,30 @@ def test_only_the_levels_asked_for_are_drawn() -> None:
         (component, level) for component in COMPONENTS for level in (2, 5)
     }
     assert all(p.effect == levels(p.component)[p.level - 1] for p in drawn)
+
+
+def test_only_the_components_asked_for_are_drawn() -> None:
+    axis = NoiseAxis.model_validate({"components": ["gaussian_blur"]})
+    assert {axis.sample(seeding.rng(seed, "noise"), TASK, 0).component for seed in range(50)} == {"gaussian_blur"}
+    with pytest.raises(ValidationError, match="components"):
+        NoiseAxis(components=())
+
+
+def test_a_component_is_configured_by_its_former_name_too() -> None:
+    rows = [{"sigma_px": sigma} for sigma in (0.5, 0.6, 0.7, 0.8, 0.9)]
+    written = NoiseAxis.model_validate({"gaussian": rows, "components": ["gaussian", "fog"]})
+    assert written == NoiseAxis.model_validate({"gaussian_blur": rows, "components": ["gaussian_blur", "fog"]})
+    with pytest.raises(ValidationError, match="gaussian is the former name of gaussian_blur"):
+        NoiseAxis.model_validate({"gaussian": rows, "gaussian_blur": rows})
+
+
+def test_what_is_stored_keeps_the_former_name() -> None:
+    """So that ids of episodes, and with them their frames, stay what they were."""
+    stored = '[{"axis":"noise","component":"gaussian","level":2,"effect":{"sigma_px":3.5},"seed":1}]'
+    (blur,) = from_json(stored)
+    assert blur.component == "gaussian_blur"
+    assert json.loads(to_json([blur])) == json.loads(stored)
+    assert from_json(stored.replace("gaussian", "gaussian_blur")) == (blur,)
 
 
 def sample(seed: int) -> NoisePerturbation:
@@ -406,7 +435,7 @@ def test_levels_grow_stronger(component: str) -> None:
     ids=str,
 )
 def test_wrong_records_are_refused(change: dict[str, object]) -> None:
-    right = {"axis": "noise", "component": "gaussian", "effect": {"sigma_px": 3.5}, "level": 2, "seed": 1}
+    right = {"axis": "noise", "component": "gaussian_blur", "effect": {"sigma_px": 3.5}, "level": 2, "seed": 1}
     assert NoisePerturbation.model_validate(right).effect == Gaussian(sigma_px=3.5)
     with pytest.raises(ValidationError):
         NoisePerturbation.model_validate(right | change)
@@ -414,6 +443,6 @@ def test_wrong_records_are_refused(change: dict[str, object]) -> None:
 
 def test_a_grid_can_be_configured_but_needs_five_levels() -> None:
     rows = [{"sigma_px": sigma} for sigma in (0.5, 0.6, 0.7, 0.8, 0.9)]
-    assert NoiseAxis.model_validate({"gaussian": rows}).gaussian[4] == Gaussian(sigma_px=0.9)
-    with pytest.raises(ValidationError, match="gaussian"):
-        NoiseAxis.model_validate({"gaussian": rows[:4]})
+    assert NoiseAxis.model_validate({"gaussian_blur": rows}).gaussian_blur[4] == Gaussian(sigma_px=0.9)
+    with pytest.raises(ValidationError, match="gaussian_blur"):
+        NoiseAxis.model_validate({"gaussian_blur": rows[:4]})

@@ -54,7 +54,7 @@ from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.tables import write_table
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Rendered, Scene, Trajectory, Verdict
+from pipeline.types import Jpeg, Rendered, Scene, Trajectory, Verdict
 
 LIMIT_S = 20
 """Time limit of a case; a longer case counts as a hang."""
@@ -222,7 +222,10 @@ def _frames() -> bytes:
     def write(folder: Path) -> Path:
         state, joints, action = (values.astype(np.float32) for values in _arrays(20, 8, 7, 7))
         store = FrameStore(folder, RenderConfig())
-        streams = {"one": [bytes([n]) * 200 for n in range(20)], "two": [bytes([n]) * 90 for n in range(20)]}
+        streams = {
+            "one": [Jpeg(bytes([n]) * 200) for n in range(20)],
+            "two": [Jpeg(bytes([n]) * 90) for n in range(20)],
+        }
         store.save("frames", Rendered("open_loop", state, joints, action, streams, {"three": "too_dark"}), "llvmpipe")
         (name,) = store.names()
         return store.path(name)
@@ -244,8 +247,7 @@ def _record() -> bytes:
 
 
 def _read_record(file: Path) -> object:
-    from pipeline.export_config import RldsConfig
-    from pipeline.formats.rlds import Rlds
+    from pipeline.formats.rlds import Rlds, RldsConfig
 
     return Rlds(file.parent, RldsConfig(name="libero_tiny", shards=1)).record()
 

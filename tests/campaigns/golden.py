@@ -1,8 +1,8 @@
 """Recorded results of a few short real episodes; `python tests/campaigns/golden.py` adds missing results.
 
-Recorded results are never overwritten. If a result has changed, raise its step's number in
-``pipeline.identity.RECIPES`` in the same commit, and run this script again. The new number generates every stored file
-of that step again.
+Recorded results are never overwritten. If a result has changed, raise the number in the same commit and run this script
+again: in ``pipeline.identity.RECIPES``, or in the class of the format. The new number generates every stored file of
+the step or format again.
 """
 
 import hashlib
@@ -22,6 +22,7 @@ import numpy as np
 from pipeline import gl, identity
 from pipeline.axes import PhysicsPerturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer
 from pipeline.config import RenderConfig, ReplayConfig
+from pipeline.formats.registry import FORMATS
 from pipeline.images.jpeg import encode
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
@@ -94,7 +95,7 @@ class Golden:
         """Return the digest of an encoded synthetic picture."""
         rows, columns = np.mgrid[0:256, 0:256]
         picture = np.stack([rows, columns, rows ^ columns], axis=-1).astype(np.uint8)
-        return hashlib.sha256(encode(picture, RenderConfig())).hexdigest()[:16]
+        return hashlib.sha256(encode(picture, RenderConfig().jpeg_quality)).hexdigest()[:16]
 
 
 def _first_frames(renderer: Renderer, trajectory: Trajectory, case: str, listed: str) -> dict[str, Frame]:
@@ -132,13 +133,19 @@ def recorded() -> dict[str, Any]:
     return content
 
 
+def recipes() -> dict[str, int]:
+    """Map each step and each format to its recipe number."""
+    steps: dict[str, int] = dict(identity.RECIPES.items())
+    return steps | {kind.name: kind.recipe for kind in FORMATS}
+
+
 def main() -> None:
     import golden_stages  # here, as it needs no renderer and imports many modules
 
     gl.choose()
     content = recorded()
     golden, device = Golden(content["cases"]), gl.choose().device
-    number = {step: str(recipe) for step, recipe in identity.RECIPES.items()}
+    number = {step: str(recipe) for step, recipe in recipes().items()}
     pixels = content["pixels"].setdefault(number["pixels"], {"thumbnails": golden.thumbnails(), "devices": {}})
     for results, key, result, layer in (
         (content["physics"], number["physics"], golden.physics(), "physics"),
@@ -147,7 +154,7 @@ def main() -> None:
         *((content.setdefault(step, {}), number[step], make(), step) for step, make in golden_stages.STEPS.items()),
     ):
         if results.setdefault(key, result) != result:
-            sys.exit(f"{layer} has changed and its number has not: raise pipeline.identity.RECIPES[{layer!r}]")
+            sys.exit(f"{layer} has changed and its recipe number has not: raise it")
     FILE.write_text(json.dumps(content, indent=1) + "\n")
 
 

@@ -11,15 +11,17 @@ from typing import Any
 
 import numpy as np
 from conftest import STOVE
-from synthetic import IDS, episode, files, write_lerobot, write_lerobot_v21, write_rlds
+from synthetic import IDS, episode, files, write_format, write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
-from pipeline.formats.lerobot_statistics import DEVIATION, FIGURES, MEAN_LEVELS
-from pipeline.formats.lerobot_video import ENCODER, OPTIONS, planes
+from pipeline.formats.lerobot.columns import ENCODER, ENCODER_OPTIONS
+from pipeline.formats.lerobot.write import planes
 from pipeline.formats.read_back import Copy, Statistics, sampled
+from pipeline.formats.registry import FORMATS
+from pipeline.formats.stated_statistics import DEVIATION, FIGURES, MEAN_LEVELS
 from pipeline.images.jpeg import decode
 from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.report import figures
@@ -34,7 +36,7 @@ TEMPLATES = ("report.html.j2", "macros.html.j2", "style.css")
 
 
 def rlds() -> str:
-    """Return the digest of all files of a dataset of six synthetic episodes."""
+    """Return the digest of all files of a dataset of three shards."""
     return _written(write_rlds)
 
 
@@ -54,7 +56,7 @@ def lerobot_v21() -> str:
 
 def _encoded() -> str:
     first_frame = planes(decode(episode(IDS[0]).frames["image"][0]))
-    return digest(hashlib.sha256(first_frame.tobytes()).hexdigest(), ENCODER, OPTIONS)
+    return digest(hashlib.sha256(first_frame.tobytes()).hexdigest(), ENCODER, ENCODER_OPTIONS)
 
 
 def _written(write: Callable[[Path], Any]) -> str:
@@ -150,7 +152,9 @@ def pictures() -> dict[str, str]:
     }
 
 
-STEPS: dict[Any, Callable[[], Any]] = {
-    step.__name__: step for step in (rlds, lerobot, lerobot_v21, evaluation, checks, pictures)
-}
-"""Step of ``pipeline.identity.RECIPES`` to the function that returns its output, JSON-serialisable."""
+STEPS: dict[str, Callable[[], Any]] = {kind.name: partial(_written, partial(write_format, kind)) for kind in FORMATS}
+STEPS |= {step.__name__: step for step in (rlds, lerobot, lerobot_v21, evaluation, checks, pictures)}
+"""Format or step of ``pipeline.identity.RECIPES`` to the function that returns its output, JSON-serialisable.
+
+A format without a function of its own has the digest of all files of a dataset of six synthetic episodes.
+"""

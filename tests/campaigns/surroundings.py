@@ -110,7 +110,7 @@ def remade_by_another_clock(clone: Path) -> list[str]:
     for file in files:
         os.utime(file, (ahead_s, ahead_s))
     faults = []
-    for name in ("replay", "render", "export_rlds", "export_lerobot"):
+    for name in ("replay", "render", "exports"):
         done = stage(clone, name)
         if done.returncode:
             faults.append(f"{name} fails with files of the future: {done.stderr[-300:]}")

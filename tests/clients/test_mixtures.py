@@ -44,7 +44,9 @@ def test_openvla_oft_counts_steps_that_it_does_not_train_on(split: str, about: b
     assert "equally often" in source
 
 
-@pytest.mark.parametrize("export", [export_config(), ExportConfig(rlds=None)], ids=["with RLDS", "without"])
+@pytest.mark.parametrize(
+    "export", [export_config(), ExportConfig.model_validate({"rlds": None})], ids=["with RLDS", "without"]
+)
 def test_the_script_of_openvla_oft_is_there_with_rlds_alone(export: ExportConfig, tmp_path: Path) -> None:
     made = tiny_recipe(tmp_path, export)
     write(made, tmp_path / "finetune", export, datasets_in(tmp_path))

@@ -18,13 +18,12 @@ from pipeline.clients import oft
 from pipeline.compute.pool import loop
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.export_config import RldsConfig
 from pipeline.formats import exact_statistics, rlds_write
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.rlds_layout import datasets
 from pipeline.run.export import export
-from pipeline.types import Episode, Geometry
+from pipeline.types import Episode, Geometry, Jpeg
 
 NAME = "libero_tiny"
 LENGTHS = {"a": 30, "b": 8, "c": 19}
@@ -60,8 +59,8 @@ def episode(name: str) -> Episode:
     )
 
 
-def frame(grey: int) -> bytes:
-    return cv2.imencode(".jpg", np.full((256, 256, 3), grey, np.uint8))[1].tobytes()
+def frame(grey: int) -> Jpeg:
+    return Jpeg(cv2.imencode(".jpg", np.full((256, 256, 3), grey, np.uint8))[1].tobytes())
 
 
 def grey(jpeg: bytes) -> int:
@@ -160,7 +159,7 @@ def first(made: Episode, steps: int) -> Episode:
 
 
 def unreadable(made: Episode) -> Episode:
-    small = cv2.imencode(".jpg", np.zeros((128, 128, 3), np.uint8))[1].tobytes()
+    small = Jpeg(cv2.imencode(".jpg", np.zeros((128, 128, 3), np.uint8))[1].tobytes())
     return replace(made, frames={**made.frames, "wrist_image": [small, *made.frames["wrist_image"][1:]]})
 
 

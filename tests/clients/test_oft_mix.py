@@ -18,7 +18,8 @@ from conftest import datasets_in
 
 from pipeline.clients.recipe import build, write
 from pipeline.clients.templates.run_openvla_oft import mixed
-from pipeline.export_config import ExportConfig, RldsConfig
+from pipeline.export_config import ExportConfig
+from pipeline.formats.rlds import RldsConfig
 
 RLDS = "prismatic/vla/datasets/rlds"
 STAND_INS = {
@@ -94,7 +95,7 @@ def trained(folder: Path, *words: str) -> tuple[dict[str, Any], dict[str, Any]]:
         for suite in ("goal", "spatial")
     ]
     (folder / "data" / "manifest.parquet").write_bytes(b"rows")
-    export = ExportConfig(rlds=RldsConfig(name="libero_mine"), lerobot=None)
+    export = ExportConfig.model_validate({"rlds": RldsConfig(name="libero_mine"), "lerobot": None})
     recipe = build(folder / "data" / "manifest.parquet", rows, export)
     write(recipe, folder / "data" / "finetune", export, datasets_in(folder / "data"))
     checkout = folder / "oft"

@@ -13,8 +13,8 @@ from synthetic import IDS, SET, episode, write_lerobot_v21
 from tiny_recipe import NAME, ROWS, SUITES, export_config, row, tiny_recipe
 
 from pipeline.clients.recipe import build, write
+from pipeline.export_config import ExportConfig
 from pipeline.files import schema_file
-from pipeline.formats.registry import formats_of
 
 
 def test_recipe_counts_what_was_kept(tmp_path: Path) -> None:
@@ -48,8 +48,33 @@ def test_openvla_oft_measures_what_every_set_holds_out(held_out: tuple[str, ...]
 @pytest.mark.parametrize("convention", ["ipec", "openpi"])
 def test_every_client_is_named_by_the_format_that_it_reads(convention: str, tmp_path: Path) -> None:
     export = export_config(lerobot_v21={"name": NAME, "convention": convention})
-    named = [client for one in formats_of(tmp_path, export) for client in one.clients]
+    named = [client for one in export.datasets(tmp_path) for client in one.clients]
     assert sorted(named) == sorted(tiny_recipe(tmp_path, export)["clients"])
+
+
+@pytest.mark.parametrize("convention", [None, "ipec", "openpi"])
+def test_a_client_without_its_format_is_named_with_the_setting_that_exports_it(
+    convention: str | None, tmp_path: Path
+) -> None:
+    further = {"lerobot_v21": {"name": NAME, "convention": convention}} if convention else {}
+    recipe = tiny_recipe(tmp_path, export_config(**further))
+    jsonschema.validate(recipe, json.loads(schema_file("finetune.json").read_text()))
+    missing = recipe["clients_of_other_formats"]
+    assert not missing.keys() & recipe["clients"].keys()
+    assert {"openpi", "gr00t", "starvla"} <= missing.keys() | recipe["clients"].keys()
+    for client, setting in missing.items():
+        written = yaml.safe_load(setting)["export"]["lerobot_v21"]
+        export = export_config(lerobot_v21={"name": NAME, **written})
+        assert client in tiny_recipe(tmp_path, export)["clients"]
+
+
+def test_clients_of_formats_that_are_left_out_are_named(tmp_path: Path) -> None:
+    v21 = {"name": NAME, "convention": "ipec"}
+    export = ExportConfig.model_validate({"rlds": None, "lerobot": None, "lerobot_v21": v21})
+    missing = tiny_recipe(tmp_path, export)["clients_of_other_formats"]
+    oft, act = (yaml.safe_load(missing[client])["export"] for client in ("openvla_oft", "lerobot_act"))
+    assert "rlds" in ExportConfig.model_validate({"lerobot": None, **oft}).formats
+    assert "lerobot" in ExportConfig.model_validate({"rlds": None, **act}).formats
 
 
 def test_recipe_changes_with_the_dataset(tmp_path: Path) -> None:

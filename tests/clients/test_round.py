@@ -29,12 +29,11 @@ from pipeline.evaluation.policies import Look, Wanted
 from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.export_config import ExportConfig
 from pipeline.formats import exact_statistics
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.libero.starts import kept_actions
 from pipeline.run.export import export
 from pipeline.types import Episode, Floats
@@ -77,7 +76,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         export(target, Episodes(known, made.__getitem__), loop)
     statistics = exact_statistics.openvla([(one.action, one.state) for one in made.values()])
     (data / "dataset_statistics.json").write_text(json.dumps({SET: statistics}))
-    options = ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=v21)
+    options = ExportConfig.model_validate({"rlds": rlds, "lerobot": lerobot, "lerobot_v21": v21})
     recipe.write({}, data / "finetune", options, datasets_in(data))
     return data
 

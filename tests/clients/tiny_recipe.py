@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.clients.recipe import build
-from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
+from pipeline.export_config import ExportConfig
+from pipeline.formats.lerobot import LeRobotConfig
+from pipeline.formats.rlds import RldsConfig
 
 NAME = "libero_tiny"
 SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}
@@ -25,7 +27,9 @@ ROWS = [
 
 
 def export_config(**further: Any) -> ExportConfig:
-    return ExportConfig(rlds=RldsConfig(name=NAME, shards=2), lerobot=LeRobotConfig(name="tiny", shards=1), **further)
+    return ExportConfig.model_validate(
+        {"rlds": RldsConfig(name=NAME, shards=2), "lerobot": LeRobotConfig(name="tiny", shards=1), **further}
+    )
 
 
 def tiny_recipe(folder: Path, export: ExportConfig | None = None, rows: list[dict[str, Any]] = ROWS) -> dict[str, Any]:

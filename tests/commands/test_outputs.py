@@ -45,12 +45,12 @@ HTML = b"<!doctype html><title>Mine</title>"
 CASES = (
     ("sheet.png", picture("PNG"), (*PREVIEW, "sheet.png")),
     ("mine.jpg", picture("JPEG"), (*PREVIEW, "mine.jpg")),
-    ("report.html", HTML, ("analyse", "report", "results")),
-    ("report.json", b'{"loss": [1.0]}', ("analyse", "report", "results")),
-    ("tasks.json", b'{"tasks": ["mine"]}', ("analyse", "construct", "--out", "tasks.json")),
-    ("tasks.json", b'{"tasks": ["mine"]}', ("analyse", "grade", "results", "--out", "tasks.json")),
-    ("results/gap.png", picture("PNG"), ("analyse", "gap", "results")),
-    ("results/gap.json", b'{"gap": 1}', ("analyse", "gap", "results")),
+    ("report.html", HTML, ("analyze", "report", "results")),
+    ("report.json", b'{"loss": [1.0]}', ("analyze", "report", "results")),
+    ("tasks.json", b'{"tasks": ["mine"]}', ("analyze", "construct", "--out", "tasks.json")),
+    ("tasks.json", b'{"tasks": ["mine"]}', ("analyze", "grade", "results", "--out", "tasks.json")),
+    ("results/gap.png", picture("PNG"), ("analyze", "gap", "results")),
+    ("results/gap.json", b'{"gap": 1}', ("analyze", "gap", "results")),
     ("bank.yaml", b"mine: true\n", (*REWRITE, "--out", "bank.yaml")),
     ("policy/summary.json", b"{}", ("evaluate", "policy", "--replay", "--task", STOVE.name, "--workers", "1")),
     ("policy/config.json", b"{}", ("evaluate", "policy", "--replay", "--task", STOVE.name, "--workers", "1")),
@@ -80,7 +80,7 @@ def test_a_file_of_another_kind_is_named_and_stays(
 def test_what_a_command_wrote_it_overwrites(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(results.parent)
     for _ in range(2):
-        assert called(monkeypatch, "analyse", "report", "results") == 0
-        assert called(monkeypatch, "analyse", "gap", "results") == 0
-        assert called(monkeypatch, "analyse", "grade", "results", "--out", "tasks.json") == 0
+        assert called(monkeypatch, "analyze", "report", "results") == 0
+        assert called(monkeypatch, "analyze", "gap", "results") == 0
+        assert called(monkeypatch, "analyze", "grade", "results", "--out", "tasks.json") == 0
     assert json.loads(Path("tasks.json").read_text())["tasks"]

@@ -25,7 +25,7 @@ from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.identity import REMAKE, made_with
-from pipeline.machine_code import SETTINGS
+from pipeline.machine_code import MACHINE_CODE_VARIABLES
 from pipeline.planning import plan
 from pipeline.run.claim import locked
 from pipeline.run.render_job import RenderJob
@@ -104,7 +104,7 @@ def run(folder: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch
     file.parent.mkdir(exist_ok=True)
     file.write_text(yaml.safe_dump(config))
     monkeypatch.chdir(folder)
-    for stage in ("plan", "replay", "render", "export_rlds"):
+    for stage in ("plan", "replay", "render", "exports"):
         monkeypatch.setattr(sys, "argv", [stage, "configs/tiny.yaml"])
         runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"), run_name="__main__")
     data = folder / "data" / "tiny"
@@ -157,7 +157,7 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     assert "has code of pipeline " in message
     assert "runs 2 threads" in message
     assert re.search(r"has machine code Sandybridge \w+, the run has Haswell AVX2", message)
-    assert f'OPENBLAS_CORETYPE="{SETTINGS["OPENBLAS_CORETYPE"]}"' in message
+    assert f'OPENBLAS_CORETYPE="{MACHINE_CODE_VARIABLES["OPENBLAS_CORETYPE"]}"' in message
     assert "dask worker ADDRESS --nthreads 1" in message
     assert not list((tmp_path / "elsewhere").rglob("data"))
 

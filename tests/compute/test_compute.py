@@ -206,7 +206,7 @@ def test_without_work_nothing_is_started(tmp_path: Path) -> None:
 def test_only_replay_and_render_load_the_simulator() -> None:
     script = (
         "import sys, runpy, pipeline.stages; "
-        "[runpy.run_path(f'stages/{stage}.py') for stage in ('plan', 'export_rlds', 'export_lerobot', 'manifest')]; "
+        "[runpy.run_path(f'stages/{stage}.py') for stage in ('plan', 'exports', 'manifest')]; "
         "print([name for name in ('mujoco', 'robosuite', 'tensorflow') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -259,6 +259,19 @@ def test_a_perturbation_that_is_drawn_otherwise_now_is_run_again(
         replayed.check(tasks)
 
 
+def test_results_of_a_renamed_component_still_count(tmp_path: Path) -> None:
+    """The blur was called gaussian; its results are named and read as before."""
+    chosen = CHOSEN.model_copy(update={"source": "libero_plus", "components": ("gaussian_blur",), "subset": 1})
+    (task,) = select(chosen)
+    former = replace(task, component="gaussian")
+    replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
+    assert replayed.episode(former) == replayed.episode(task)
+    EpisodeFiles(tmp_path).save(result(former, episode=replayed.episode(former), versions=replayed.versions(task)))
+    stored = replayed.result(task)
+    assert stored is not None
+    assert stored.component == "gaussian_blur"
+
+
 def test_a_folder_has_frames_of_one_device(tmp_path: Path) -> None:
     (task,) = select(CHOSEN)
     replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)

@@ -90,7 +90,7 @@ def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
 def test_a_server_that_dies_ends_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    suites = ["--suite", "libero_object", "libero_goal", "--task", "pick_up_the_milk*", "turn_on*"]
+    suites = ["--suite", "libero_object", "--suite", "libero_goal", "--task", "pick_up_the_milk*", "--task", "turn_on*"]
     options = ["--initial-states", "demonstration", "--workers", "1"]
     with running(FAULTY_SERVER, "--args.dies", "true") as address:
         command = ["pipeline", "evaluate", str(tmp_path), *suites, *options, "--server", address, "--label", "faulty"]

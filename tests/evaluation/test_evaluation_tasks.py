@@ -241,7 +241,7 @@ def test_tasks_of_unknown_level_are_counted_where_a_level_is_asked_for(capsys: p
         ({"file": Path("tasks.json"), "episodes": 2}, "leave --episodes out"),
         ({"file": Path("tasks.json"), "source": "libero"}, "leave --source or --tasks-from out"),
         ({"levels": (3,)}, "expected: 0"),
-        ({"source": "libero_plus", "components": ("dist",)}, "distance or fog or gaussian"),
+        ({"source": "libero_plus", "components": ("dist",)}, "distance or fog or gaussian_blur"),
         ({"source": "own", "axes": ("camera",), "components": ("dist",)}, "distance or orientation or spherical"),
         ({"components": ("distance",)}, "expected: clean"),
         ({"suites": ("libero_gaol",)}, "libero_10 or libero_90 or libero_goal"),

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import STOVE
-from episode_results import analyse, result
+from episode_results import analyze, result
 
 from pipeline.axes import Perturbation, to_json
 from pipeline.axes.camera import CameraPerturbation
@@ -49,7 +49,7 @@ def test_a_planted_copy_of_a_held_out_draw_is_found(axis: str) -> None:
 
 def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
     axis = NoiseAxis()
-    effects = [effect for name in ("motion", "gaussian", "zoom", "fog", "glass") for effect in getattr(axis, name)]
+    effects = [effect for name in ("motion", "gaussian_blur", "zoom", "fog", "glass") for effect in getattr(axis, name)]
     trained = [NoisePerturbation(component=effect.component, effect=effect, level=1, seed=0) for effect in effects]
     tasks = select(Selection(source="own", axes=("noise",), episodes=2))
     planned = PlannedDraws([planned_row(tasks[0], one) for one in trained])
@@ -69,11 +69,11 @@ def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFix
     file = tmp_path / "mine" / "plan.parquet"
     file.parent.mkdir()
     plan.write([planned_row(tasks[0], draw(tasks[0], 0))], file)
-    assert analyse("leakage", str(tmp_path), str(config)) == 1
+    assert analyze("leakage", str(tmp_path), str(config)) == 1
     printed = json.loads(capsys.readouterr().out)
     assert (printed["robot"]["overlaps"], printed["light"]["overlaps"]) == (1, 0)
     plan.write([planned_row(tasks[0], draw(tasks[0], 1))], file)
-    assert analyse("leakage", str(tmp_path), str(config)) == 0
+    assert analyze("leakage", str(tmp_path), str(config)) == 0
 
 
 def test_language_has_no_held_out_draws_and_says_what_else_there_is() -> None:

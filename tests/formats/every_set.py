@@ -17,9 +17,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 from synthetic import IDS, NAME, REPO, SET, episode, episodes, loop
 
-from pipeline.export_config import LeRobotConfig, RldsConfig
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export
 
 MIN_PSNR_DB = 36.0
@@ -35,6 +34,8 @@ def psnr_db(a: NDArray[Any], b: NDArray[Any]) -> float:
 
 @dataclass(frozen=True)
 class Written:
+    """The datasets of six episodes in each format."""
+
     rlds: Rlds
     lerobot: LeRobot
     images: LeRobot

@@ -13,7 +13,7 @@ from synthetic import IDS, episode, files, with_extras, write_lerobot, write_rld
 
 from pipeline.episode_schema import SCHEMA, check
 from pipeline.errors import PipelineError
-from pipeline.types import Episode
+from pipeline.types import Episode, Jpeg
 
 
 def as_png(jpeg: bytes) -> bytes:
@@ -34,7 +34,7 @@ def test_a_frame_that_is_no_whole_jpeg_is_refused(change: Callable[[bytes], byte
     whole = episode(IDS[0])
     check(whole)
     frames = list(whole.frames["image"])
-    frames[3] = change(frames[3])
+    frames[3] = Jpeg(change(frames[3]))
     with pytest.raises(PipelineError, match=message):
         check(replace(whole, frames={**whole.frames, "image": frames}))
 
@@ -43,6 +43,10 @@ def truncated(source: Episode, steps: int) -> Episode:
     frames = {view: frames[:steps] for view, frames in source.frames.items()}
     arrays = {name: getattr(source, name)[:steps] for name in ("state", "joint_state", "action")}
     return replace(source, frames=frames, **arrays)
+
+
+def cut(jpeg: Jpeg) -> Jpeg:
+    return Jpeg(jpeg[:-99])
 
 
 BAD: dict[str, tuple[str, Callable[[Episode], Episode]]] = {
@@ -60,8 +64,8 @@ BAD: dict[str, tuple[str, Callable[[Episode], Episode]]] = {
     "lost camera": ("geometry", lambda e: replace(e, geometry={})),
     "depth unasked": ("image maps", lambda e: replace(e, geometry=with_extras(e.episode_id).geometry)),
     "lost view": ("frames", lambda e: replace(e, frames={"image": e.frames["image"]})),
-    "no image": ("image", lambda e: replace(e, frames={**e.frames, "image": [b"noise"] * len(e)})),
-    "cut image": ("image", lambda e: replace(e, frames={**e.frames, "image": [f[:-99] for f in e.frames["image"]]})),
+    "no image": ("image", lambda e: replace(e, frames={**e.frames, "image": [Jpeg(b"noise")] * len(e)})),
+    "cut image": ("image", lambda e: replace(e, frames={**e.frames, "image": [cut(f) for f in e.frames["image"]]})),
     "lost column": ("provenance", lambda e: replace(e, provenance={"episode_id": e.episode_id})),
     "wrong id": ("provenance", lambda e: replace(e, provenance={**e.provenance, "episode_id": "other"})),
     "no number": ("provenance", lambda e: replace(e, provenance={**e.provenance, "seed": "7"})),

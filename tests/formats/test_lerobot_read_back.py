@@ -14,8 +14,7 @@ from synthetic import IDS, episode, write_lerobot, write_lerobot_v21
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21
 from pipeline.formats.read_back import Fault
 from pipeline.types import Episode, Scene, Trajectory, Verdict
 from pipeline.validation.case import Case

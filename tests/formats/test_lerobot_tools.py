@@ -15,7 +15,8 @@ from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from synthetic import IDS, NAME, episode, write_lerobot
 
 from pipeline.clients import recipe
-from pipeline.export_config import ExportConfig, LeRobotConfig
+from pipeline.export_config import ExportConfig
+from pipeline.formats.lerobot import LeRobotConfig
 
 pytestmark = pytest.mark.slow
 KEYS = ("action", "observation.state", "observation.joint_state")
@@ -64,7 +65,7 @@ def test_takes_the_words_of_the_recipe(tmp_path: Path) -> None:
     """As lerobot-train reads pi0.5's; SmolVLA's begin with its weights from the hub, where its reader looks first."""
     manifest = tmp_path / "manifest"
     manifest.touch()
-    clients = recipe.build(manifest, [], ExportConfig(lerobot=LeRobotConfig(name=NAME)))["clients"]
+    clients = recipe.build(manifest, [], ExportConfig.model_validate({"lerobot": LeRobotConfig(name=NAME)}))["clients"]
     words = shlex.split(clients["lerobot_pi05"]["command"])[1:]
     pi05: Any = draccus.argparsing.parse(TrainPipelineConfig, args=words)
     assert (pi05.dataset.repo_id, pi05.policy.push_to_hub) == (NAME, False)

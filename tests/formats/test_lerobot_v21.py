@@ -16,7 +16,7 @@ from every_set import MIN_PSNR_DB, pixels, psnr_db, spread
 from numpy.typing import NDArray
 from synthetic import EXTRAS, IDS, REPO, SET, episode, files, with_extras, write_lerobot_v21
 
-from pipeline.formats import lerobot_v21
+from pipeline.formats import lerobot
 
 V21 = {
     "ipec": (SET, "observation.images.image", "observation.images.wrist_image", "observation.state", "action"),
@@ -86,7 +86,7 @@ def test_v21_does_not_depend_on_workers_and_keeps_extras(convention: str, tmp_pa
         pytest.MonkeyPatch.context() as patch,
         ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor,
     ):
-        patch.setattr(lerobot_v21, "EPISODES_OF_A_PIECE", 1)
+        patch.setattr(lerobot, "EPISODES_OF_A_PIECE", 1)
         run = partial(spread, executor)
         two = write_lerobot_v21(tmp_path / "two", convention, with_extras, run, EXTRAS)
         # Another number of pieces, and so another identity, but the same files.

@@ -26,11 +26,10 @@ from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_
 
 from pipeline.clients import recipe
 from pipeline.errors import PipelineError
-from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig, Where
+from pipeline.export_config import ExportConfig, Where
 from pipeline.formats.episodes import Episodes, Known, split
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run.export import export
 
@@ -81,13 +80,13 @@ def test_split_keeps_order_and_balance() -> None:
 
 def test_each_suite_of_rlds_must_have_a_validation_split() -> None:
     """OpenVLA-OFT asks each set of a mixture for one."""
-    options = ExportConfig(rlds=RldsConfig(name=NAME, validation=0.1), lerobot=None)
+    options = ExportConfig.model_validate({"rlds": RldsConfig(name=NAME, validation=0.1), "lerobot": None})
     options.refuse_too_few({"libero_goal": 10, "my_suite": 6})
     with pytest.raises(PipelineError, match="no task has enough demonstrations"):
         options.refuse_too_few({"libero_goal": 10, "my_suite": 4})
     of_goal = options.model_copy(update={"where": Where(suite=("libero_goal",))})
     of_goal.refuse_too_few({"libero_goal": 10, "my_suite": 4})
-    of_one = ExportConfig(rlds=None, lerobot=LeRobotConfig(name=NAME, validation=0.1))
+    of_one = ExportConfig.model_validate({"rlds": None, "lerobot": LeRobotConfig(name=NAME, validation=0.1)})
     of_one.refuse_too_few({"libero_goal": 10, "my_suite": 4})
 
 
@@ -162,7 +161,9 @@ def test_lerobot_trains_without_what_is_held_out(
     """By the recipe's command for ACT, read by lerobot's own parser and opened by its own factory."""
     data = held_out.parents[1]
     (data / "manifest.parquet").touch()
-    options = ExportConfig(rlds=None, lerobot=LeRobotConfig(name=NAME, shards=3, validation=0.34))
+    options = ExportConfig.model_validate(
+        {"rlds": None, "lerobot": LeRobotConfig(name=NAME, shards=3, validation=0.34)}
+    )
     made = recipe.build(data / "manifest.parquet", [], options)
     recipe.write(made, data / "finetune", options, datasets_in(data))
     commands = {name: client["command"].replace("$DATA", str(data)) for name, client in made["clients"].items()}
@@ -191,7 +192,7 @@ def test_what_is_held_out_of_v21_is_a_set_of_its_own(
         assert list(dict.fromkeys(row["episode_id"] for row in rows)) == ids
         assert [row["index"] for row in rows] == list(range(len(rows)))
     rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
-    formats = ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=options)
+    formats = ExportConfig.model_validate({"rlds": rlds, "lerobot": lerobot, "lerobot_v21": options})
     recipe.write({}, tmp_path / "finetune", formats, datasets_in(tmp_path))
     if convention == "openpi":
         found = json.loads((tmp_path / "finetune" / recipe.OPENPI_ASSETS).read_text())["norm_stats"]

@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 
-from pipeline.config import RenderConfig
 from pipeline.images.jpeg import encode
 
 
@@ -16,6 +15,6 @@ def test_a_file_is_quantised_as_pillow_does_at_that_quality(quality: int) -> Non
     red = np.zeros((16, 16, 3), np.uint8) + np.array([200, 40, 90], np.uint8)
     theirs = io.BytesIO()
     Image.fromarray(red).save(theirs, "jpeg", quality=quality)
-    ours = JpegImageFile(io.BytesIO(encode(red, RenderConfig(jpeg_quality=quality))))
+    ours = JpegImageFile(io.BytesIO(encode(red, quality)))
     assert ours.quantization == JpegImageFile(io.BytesIO(theirs.getvalue())).quantization
     assert np.abs(np.asarray(ours).astype(int) - red).max() < 12

@@ -169,7 +169,7 @@ def test_what_misses_once_settled_is_tracked_along_its_unsettled_replay(tmp_path
     (twin,) = plan.make(demos.index().entries, wanted, ReplayConfig(), TestSet(()))
     job = ReplayJob(twin, twin.trajectory_id, demos, ReplayConfig(mode="open_loop"), tmp_path)
     assert job() == Verdict(False, "goal_not_reached")
-    assert replace(job, config=ReplayConfig(mode="auto"))() == Verdict(True, "kept")
+    assert replace(job, replay_config=ReplayConfig(mode="auto"))() == Verdict(True, "kept")
     assert TrajectoryStore(tmp_path).load(twin.trajectory_id).mode == "tracked"
 
 

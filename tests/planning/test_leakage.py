@@ -206,24 +206,24 @@ def test_coverage_is_the_distance_of_test_tasks_to_what_is_wanted(test: TestSet)
 
     def gaussian(sigma_px: float) -> Row:
         effect = {"sigma_px": sigma_px}
-        fields = {"axis": "noise", "component": "gaussian", "level": 1, "effect": effect, "seed": 1}
+        fields = {"axis": "noise", "component": "gaussian_blur", "level": 1, "effect": effect, "seed": 1}
         return row(task, from_json(json.dumps([fields])), f"{sigma_px}")
 
     # In steps: the weak one stands half a step from severity 1 and 8.5 from severity 10, the reserve does not count.
     rows = [gaussian(1.5), replace(gaussian(9.5), wanted=False)]
     found = leakage.check(rows, test)["noise"].coverage
-    assert set(found) == {"motion", "gaussian", "zoom", "fog", "glass"}
+    assert set(found) == {"motion", "gaussian_blur", "zoom", "fog", "glass"}
     assert (found["fog"].test_tasks, found["fog"].compared, found["fog"].median) == (272, 0, None)
-    assert (found["gaussian"].test_tasks, found["gaussian"].compared) == (341, 341)
-    assert (found["gaussian"].smallest, found["gaussian"].largest) == (0.5, 8.5)
+    assert (found["gaussian_blur"].test_tasks, found["gaussian_blur"].compared) == (341, 341)
+    assert (found["gaussian_blur"].smallest, found["gaussian_blur"].largest) == (0.5, 8.5)
     severities = [
-        int(tested.parameters["severity"]) for tested in test.on_axis("noise") if tested.component == "gaussian"
+        int(tested.parameters["severity"]) for tested in test.on_axis("noise") if tested.component == "gaussian_blur"
     ]
     away = sorted(abs(severity - 1.5) for severity in severities)
     # Places 170 and 306 of 0 to 340.
-    assert (found["gaussian"].median, found["gaussian"].p90) == (away[170], away[306])
+    assert (found["gaussian_blur"].median, found["gaussian_blur"].p90) == (away[170], away[306])
     # Each test task counts with the nearest episode.
-    both = leakage.check([replace(one, wanted=True) for one in rows], test)["noise"].coverage["gaussian"]
+    both = leakage.check([replace(one, wanted=True) for one in rows], test)["noise"].coverage["gaussian_blur"]
     assert (both.largest, both.compared) == (3.5, 341)
 
 
@@ -309,12 +309,14 @@ def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -
     assert (some.not_compared, some.verdict) == (1, "disjoint where compared")
 
 
-def run_stage(folder: Path, rows: list[Row]) -> subprocess.CompletedProcess[str]:
-    """The stage as DVC runs it, on a plan of these rows."""
+def run_stage(folder: Path, rows: list[Row], **axes: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """The stage as DVC runs it, on a plan of these rows, with other settings of some axes."""
     (folder / "data").mkdir(exist_ok=True)
     if not (folder / benchmark.FOLDER).exists():
         (folder / benchmark.FOLDER).symlink_to(FOLDER)
-    (folder / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(folder / "demos")))
+    config = tiny_config(folder / "demos")
+    config["plan"]["axes"] |= axes
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(config))
     with chdir(folder):
         claimed(Path("tiny.yaml"))
     plan.write(rows, folder / "data" / "tiny" / "plan.parquet")
@@ -330,7 +332,7 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     assert done.returncode == 0, done.stderr
     assert re.search(r"noise +9 +1,601 +0 +0\.[45] +0\.25 +disjoint", done.stdout), done.stdout
     assert "noise: steps between the benchmark's severities" in done.stdout
-    assert re.search(r"noise +gaussian +341 +0\.5 +", done.stdout), done.stdout
+    assert re.search(r"noise +gaussian_blur +341 +0\.5 +", done.stdout), done.stdout
     report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
     assert (report["noise"]["overlaps"], report["noise"]["verdict"]) == (0, "disjoint")
     assert report["noise"]["smallest"] >= report["noise"]["clearance"]
@@ -344,6 +346,18 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
     assert (report["language"]["overlaps"], report["language"]["verdict"]) == (1, "overlap")
     assert all(math.isfinite(finding["clearance"]) for finding in report.values())
+
+
+@pytest.mark.slow
+def test_overlapping_cameras_are_reported_if_no_clearance_is_asked_for(test: TestSet, tmp_path: Path) -> None:
+    tested = next(iter(test.on_axis("camera")))
+    planted = row(find_task(tested.suite, tested.base), [repeated(tested)], "planted")
+    done = run_stage(tmp_path, [planted])
+    assert (done.returncode, "1 of 1 on the camera axis" in done.stderr) == (1, True)
+    done = run_stage(tmp_path, [planted], camera={"clear_by": "off"})
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
+    assert (report["camera"]["overlaps"], report["camera"]["verdict"]) == (1, "overlap")
 
 
 def test_an_overlap_is_explained_by_what_overlaps() -> None:

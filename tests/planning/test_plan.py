@@ -182,7 +182,7 @@ def test_an_exhausted_axis_is_said_and_planned_as_far_as_it_goes() -> None:
     wanted = config(axes=Axes(language=LanguageAxis()), episodes={"language": 300})
     rows = plan.make(entries(1), wanted, REPLAY, NO_TESTS)
     texts = {(row.task, row.instruction) for row in rows if row.axis == "language"}
-    bank = {(task.name, drawn.text) for task in TASKS for drawn in deal(task, LanguageAxis().classes)}
+    bank = {(task.name, drawn.text) for task in TASKS for drawn in deal(task, LanguageAxis().components)}
     assert texts == bank, "every rewrite once"
     assert plan.shortage(rows, wanted) == {"language": 300 - len(bank)}
     assert plan.shortage(plan.make(entries(), config(), REPLAY, NO_TESTS), config()) == {}

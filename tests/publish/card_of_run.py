@@ -18,8 +18,10 @@ from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.config import RenderConfig, ReplayConfig
-from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.export_config import ExportConfig
+from pipeline.formats.lerobot import LeRobotConfig, LeRobotV21Config
 from pipeline.formats.registry import FORMATS, columns
+from pipeline.formats.rlds import RldsConfig
 from pipeline.publish import card
 from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
@@ -112,10 +114,12 @@ def write_rows(data: Path, rows: list[dict[str, Any]], source: Literal["starter"
 
 
 NO_STATEMENT = PublishConfig()
-OPTIONS = ExportConfig(
-    rlds=RldsConfig(name=NAME, shards=1),
-    lerobot=LeRobotConfig(name=NAME, shards=1),
-    lerobot_v21=LeRobotV21Config(name=NAME, convention="ipec"),
+OPTIONS = ExportConfig.model_validate(
+    {
+        "rlds": RldsConfig(name=NAME, shards=1),
+        "lerobot": LeRobotConfig(name=NAME, shards=1),
+        "lerobot_v21": LeRobotV21Config(name=NAME, convention="ipec"),
+    }
 )
 
 

@@ -25,8 +25,9 @@ from conftest import BOWL, MILK, STOVE
 
 from pipeline.axes.pose import PoseAxis
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
-from pipeline.formats.registry import FORMATS
+from pipeline.export_config import ExportConfig
+from pipeline.formats.lerobot import LeRobotConfig
+from pipeline.formats.rlds import RldsConfig
 from pipeline.seeding import rng
 
 
@@ -38,11 +39,11 @@ def data(tmp_path: Path) -> Path:
 
 def test_other_formats_are_named_where_there_are_any(data: Path) -> None:
     assert "the same episodes exist as LeRobot and LeRobot v2.1,\njoined by `episode_id`." in written(data, "rlds")
-    alone = written(data, "rlds", ExportConfig(rlds=RldsConfig(name=NAME), lerobot=None))
+    alone = written(data, "rlds", ExportConfig.model_validate({"rlds": RldsConfig(name=NAME), "lerobot": None}))
     assert "This repository holds the RLDS form. `manifest.parquet` has" in alone
 
 
-@pytest.mark.parametrize("kind", [kind.name for kind in FORMATS])
+@pytest.mark.parametrize("kind", OPTIONS.formats)
 def test_the_hub_reads_the_metadata(data: Path, kind: str) -> None:
     metadata = metadata_of(written(data, kind))
     assert metadata["license"] == "cc-by-4.0"
@@ -165,7 +166,7 @@ def test_what_is_beside_the_frames_is_described_where_it_is_there(data: Path, ki
 def test_a_language_column_and_who_can_open_it_are_named(data: Path) -> None:
     # As it is written by lerobot 0.6, where the field is not refused.
     lerobot = LeRobotConfig(name=NAME).model_copy(update={"language": True})
-    text = written(data, "lerobot", ExportConfig(rlds=None).model_copy(update={"lerobot": lerobot}))
+    text = written(data, "lerobot", ExportConfig.model_validate({"rlds": None}).model_copy(update={"lerobot": lerobot}))
     assert "`language_persistent`" in text
     assert "before 0.6 cannot open" in text
     assert "0.6" not in written(data, "lerobot")

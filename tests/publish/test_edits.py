@@ -52,10 +52,13 @@ def test_dvc_and_the_stage_leave_an_edit_as_it_is(tmp_path: Path) -> None:
     assert second.returncode != 0
     assert "finetune.yaml (changed)" in second.stderr
     assert recipe.read_bytes() == edited
-    told = call(clone, "-m", "pipeline", "status").stdout
+    told = call(clone, "-m", "pipeline", "status", "configs/tiny.yaml").stdout
     assert "finetune.yaml (changed)" in told
     assert "REMAKE=1" in told
-    assert "finetune.yaml (changed)" in call(clone, "-m", "pipeline", "clean", "--only", "uploads").stdout
+    assert (
+        "finetune.yaml (changed)"
+        in call(clone, "-m", "pipeline", "clean", "--only", "uploads", "configs/tiny.yaml").stdout
+    )
     assert recipe.read_bytes() == edited
 
 

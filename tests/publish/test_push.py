@@ -21,8 +21,8 @@ from synthetic import SET, write_lerobot
 from validated_run import NAME, RUN, prepare, write_card, write_run
 
 from pipeline.errors import PipelineError
-from pipeline.formats import lerobot_check
-from pipeline.formats.lerobot_columns import Convention
+from pipeline.formats.lerobot import check
+from pipeline.formats.lerobot.columns import Convention
 from pipeline.publish.push import Upload, compare, send
 from pipeline.publish.repository import UPLOAD
 
@@ -102,9 +102,9 @@ def test_the_hub_is_in_reach_after_a_dataset_was_found_damaged(hub: Hub, data: P
     upload = prepare(data, "rlds")
     root = data / "lerobot" / NAME
     shutil.rmtree(root / "meta" / "episodes")
-    lerobot_check.forget_sessions()  # as in a process that has not spoken with the hub
+    check.forget_sessions()  # as in a process that has not spoken with the hub
     with pytest.raises(PipelineError, match=re.escape(str(root))):
-        list(lerobot_check.check(root, tmp_path / "cache", {}, Convention("video")))
+        list(check.check(root, tmp_path / "cache", {}, Convention("video")))
     send(upload, REPOSITORY)
     assert uploaded(hub) == expected(upload)
 
@@ -351,7 +351,7 @@ def test_the_command_says_all_of_it_and_sends_it_when_asked(hub: Hub, data: Path
     environment = {**os.environ, "HF_ENDPOINT": hub.endpoint, "HF_HUB_DISABLE_XET": "1"}
 
     def push(*options: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "pipeline", "push", "lerobot", REPOSITORY, str(config), *options]
+        command = [sys.executable, "-m", "pipeline", "dataset", "push", "lerobot", REPOSITORY, str(config), *options]
         return subprocess.run(command, cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=False)
 
     told = push()

@@ -8,9 +8,10 @@ import pyarrow.parquet as pq
 from conftest import run_in
 from synthetic import write_lerobot, write_lerobot_v21, write_rlds
 
-from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.export_config import ExportConfig
 from pipeline.files import checksum
-from pipeline.formats.registry import formats_of
+from pipeline.formats.lerobot import LeRobotConfig, LeRobotV21Config
+from pipeline.formats.rlds import RldsConfig
 from pipeline.generated import generated
 from pipeline.publish import push
 from pipeline.publish.card import REPORTS
@@ -21,12 +22,14 @@ RUN = "tiny_run"
 
 
 def prepare(data: Path, kind: str) -> Upload:
-    options = ExportConfig(
-        rlds=RldsConfig(name="synthetic", shards=3),
-        lerobot=LeRobotConfig(name=NAME, shards=3),
-        lerobot_v21=LeRobotV21Config(name="synthetic", convention="ipec"),
+    options = ExportConfig.model_validate(
+        {
+            "rlds": RldsConfig(name="synthetic", shards=3),
+            "lerobot": LeRobotConfig(name=NAME, shards=3),
+            "lerobot_v21": LeRobotV21Config(name="synthetic", convention="ipec"),
+        }
     )
-    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind), run_in(data))
+    return push.prepare(next(target for target in options.datasets(data) if target.name == kind), run_in(data))
 
 
 def write_run(data: Path) -> None:

@@ -24,7 +24,6 @@ from pipeline.compute.pool import loop
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import Stream
@@ -178,7 +177,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     known = {
         row.episode_id: Known(row.suite, "", row.demo_id, row.instruction, len(load(row.episode_id))) for row in kept
     }
-    for target in formats_of(data, config.export, config.render.extras):
+    for target in config.export.datasets(data, config.render.extras):
         export(target, Episodes(known, load), loop)
     (data / "config.json").write_text(config.model_dump_json())
     return data
@@ -189,7 +188,7 @@ def cases(data: Path) -> list[Case]:
     config = Config.model_validate_json((data / "config.json").read_text())
     load = EpisodeLoader(data, config.render)
     rows = {row.episode_id: vars(row) for row in plan.read(data / "plan.parquet")}
-    formats = formats_of(data, config.export, config.render.extras)
+    formats = config.export.datasets(data, config.render.extras)
     places: dict[str, dict[str, Any]] = {}
     for one in formats:
         for episode_id, place in one.record().places.items():

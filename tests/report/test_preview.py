@@ -15,7 +15,7 @@ from conftest import BOWL, MILK, PLATE, REPOSITORY, starter_demo
 from PIL import Image
 
 from pipeline import __main__ as command_line
-from pipeline.axes import AXES, Axes, Perturbation, PhysicsPerturbation, RenderPerturbation, to_json
+from pipeline.axes import AXES, Axes, Perturbation, PhysicsPerturbation, RenderPerturbation, components_of, to_json
 from pipeline.axes.base import Axis, Nearest
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.disturbance import DisturbanceAxis
@@ -25,7 +25,7 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.compute.pool import loop
 from pipeline.config import PlanConfig, load
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import RefusedError
+from pipeline.errors import PipelineError, RefusedError
 from pipeline.images.jpeg import decode, encode
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.environment import Environment
@@ -156,6 +156,51 @@ def test_what_is_shown_is_what_the_plan_draws(name: str, monkeypatch: pytest.Mon
     assert {to_json([perturbation]) for perturbation in shown} == {row.perturbations for row in rows}
 
 
+def test_a_combination_shows_what_the_plan_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(REPOSITORY)
+    name = "camera+noise+language"
+    monkeypatch.setattr(preview, "CANDIDATES", 12)
+    monkeypatch.setattr(preview, "VARIANTS", 12)
+    test, demo = benchmark.load(), starter_demo(MILK)
+    config = PlanConfig.model_validate({"seed": 5, "episodes": {name: 12}, "reserve": 0})
+    entry = DemoEntry(MILK, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
+    rows = [row for row in plan.make([entry], config, STARTER.replay, test) if row.role == "perturbed"]
+    shown = preview.combinations(name, preview.axes_for(name, STARTER), demo, 5, test)
+    assert {to_json(perturbations) for perturbations in shown} == {row.perturbations for row in rows}
+
+
+def test_a_sheet_of_a_combination_covers_its_components_and_changes_pictures_together(
+    stage: preview.Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[tuple[Perturbation, ...]] = []
+    frames = preview.Stage.frames
+
+    def recorded(self: preview.Stage, views: Any, *perturbations: Perturbation) -> list[Frame]:
+        shown.append(perturbations)
+        return frames(self, views, *perturbations)
+
+    monkeypatch.setattr(preview.Stage, "frames", recorded)
+    sheet = preview.axis_sheet(stage, "light+noise", STARTER, NO_TESTS)
+    nothing, *drawn = shown
+    assert (nothing, len(drawn)) == ((), preview.VARIANTS)
+    assert {(light.axis, noise.axis) for light, noise in drawn} == {("light", "noise")}
+    assert {noise.component for _, noise in drawn} == set(components_of("noise"))
+    assert {light.component for light, _ in drawn} == set(components_of("light"))
+    assert sheet.width == 4 * (2 * preview.SIDE_PX[2] + sheets.GAP_PX) + sheets.GAP_PX
+    light, noise = drawn[0]
+    both, lit, noisy = (frames(stage, VIEWS, *changes) for changes in ((light, noise), (light,), (noise,)))
+    assert not np.array_equal(both[0], lit[0])
+    assert not np.array_equal(both[0], noisy[0])
+    np.testing.assert_array_equal(both[1], lit[1], "noise leaves the wrist view")
+
+
+def test_a_combination_without_anything_left_is_an_error() -> None:
+    descriptions = Axes(language=LanguageAxis(components=("common_sense",)))
+    config = STARTER.model_copy(update={"plan": STARTER.plan.model_copy(update={"axes": descriptions})})
+    with pytest.raises(PipelineError, match="language with added objects needs distraction or paraphrase"):
+        preview.axes_for("layout+language", config)
+
+
 def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Dimming))
     original, *variants = tiles(preview.axis_sheet(stage, "dimming", STARTER, NO_TESTS), 2)
@@ -276,7 +321,9 @@ def test_an_overview_shows_the_strongest_draw_that_the_scene_takes(
     assert len(captions) == 1 + len(Axes.model_fields)
     assert set(captions[1:]) <= refused
     # No paraphrase of the task is of level 5, as no task of libero_90 has rewrites.
-    monkeypatch.setattr(preview, "configured", lambda name, config: LanguageAxis(classes=("paraphrase",), levels=(5,)))
+    monkeypatch.setattr(
+        preview, "configured", lambda name, config: LanguageAxis(components=("paraphrase",), levels=(5,))
+    )
     captions.clear()
     preview.overview(stage, STARTER, NO_TESTS)
     assert captions == [f"clean twin: {BOWL.instruction}"]
@@ -301,7 +348,7 @@ def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def stills(steps: int) -> Episode:
     """Frames with the step in their grey level."""
-    frames = [encode(np.full((256, 256, 3), 8 * step, np.uint8), STARTER.render) for step in range(steps)]
+    frames = [encode(np.full((256, 256, 3), 8 * step, np.uint8), STARTER.render.jpeg_quality) for step in range(steps)]
     nothing = np.zeros((steps, 7), np.float32)
     return Episode("", {"image": frames}, nothing, nothing, nothing, "", {}, {})
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.axes import AXES, Perturbation, to_json
+from pipeline.axes.report_data import KeptPerturbation, Strips
 from pipeline.config import Config, RenderConfig
 from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode
@@ -25,13 +26,12 @@ from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
 from pipeline.report import coverage, figures, pages, report, seen, yields
-from pipeline.report.coverage import Draw
 from pipeline.run import counts, manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.run import Run
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
-from pipeline.types import Quality
+from pipeline.types import Jpeg, Quality
 
 LIMIT_BYTES = 15_000_000
 
@@ -182,7 +182,7 @@ def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
 @pytest.mark.parametrize("name", sorted(AXES))
 def test_every_axis_has_a_picture_of_where_its_draws_lie(name: str) -> None:
     task = find_task("libero_goal", "put_the_bowl_on_the_plate")
-    draws = [Draw(task, _draw(name, variant), None) for variant in range(30)]
+    draws = [KeptPerturbation(task, _draw(name, variant), None) for variant in range(30)]
     shown = coverage.plot_axis(name, draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert shown.panels
     assert f"{len(benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis(name)):,}" in shown.note
@@ -195,18 +195,13 @@ def test_every_axis_has_a_picture_of_where_its_draws_lie(name: str) -> None:
 
 
 def test_noise_stands_between_the_benchmarks_severities() -> None:
-    seen: dict[str, NDArray[np.float64]] = {}
-
-    def strips(title: str, rows: dict[str, dict[str, NDArray[np.float64]]], label: str) -> figures.Panel:
-        seen.update({kind: groups["noise"] for kind, groups in rows.items()})
-        return figures.Panel(title, "")
-
-    draws = [Draw(find_task("libero_goal", "put_the_bowl_on_the_plate"), _draw("noise", n), None) for n in range(100)]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(coverage, "strips", strips)
-        coverage.plot_axis("noise", draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
-    assert set(seen) == {"motion", "gaussian", "zoom", "fog", "glass"}
-    for kind, severities in seen.items():
+    task = find_task("libero_goal", "put_the_bowl_on_the_plate")
+    kept = [KeptPerturbation(task, _draw("noise", n), None) for n in range(100)]
+    _, (plot,) = AXES["noise"].describe_coverage(kept, benchmark.load(REPOSITORY / benchmark.FOLDER))
+    assert isinstance(plot, Strips)
+    assert set(plot.rows) == {"motion", "gaussian blur", "zoom", "fog", "glass"}
+    for kind, groups in plot.rows.items():
+        severities = groups["noise"]
         assert len(severities), kind
         assert np.abs(severities - severities.round()).min() >= 0.25, kind
 
@@ -241,8 +236,8 @@ def _content(address: str) -> bytes:
     return base64.b64decode(address.partition(",")[2])
 
 
-def _still(frame: NDArray[np.uint8]) -> bytes:
-    return encode(frame, RenderConfig())
+def _still(frame: NDArray[np.uint8]) -> Jpeg:
+    return encode(frame, RenderConfig().jpeg_quality)
 
 
 def _video(clip: pages.Clip) -> NDArray[np.float64]:

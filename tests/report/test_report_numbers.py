@@ -11,9 +11,9 @@ from synthetic import IDS, episode
 from pipeline.axes import to_json
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.language import LanguagePerturbation
+from pipeline.axes.report_data import KeptPerturbation
 from pipeline.axes.robot import RobotAxis, RobotPerturbation
 from pipeline.report import coverage, figures, report, yields
-from pipeline.report.coverage import Draw
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats
@@ -73,7 +73,9 @@ def test_what_moved_others_farthest_comes_first() -> None:
     for one, far_m in zip(rows, (0.1, 0.3, 0.02), strict=True):
         one["non_target_moved_m"] = far_m
     shown = report._worst(rows, {twin: row(twin, "clean", 9)}, episode)  # type: ignore[arg-type]
-    assert [video.caption for video in shown] == ["30.0 cm", "10.0 cm", "2.0 cm"]
+    farthest_first = [(names[1], "30.0 cm"), (names[0], "10.0 cm"), (names[2], "2.0 cm")]
+    for video, (name, moved) in zip(shown, farthest_first, strict=True):
+        assert f"episode {name}: {moved}" in video.caption
 
 
 def test_a_video_of_an_axis_is_of_its_strongest_episode() -> None:
@@ -97,14 +99,14 @@ def test_a_rewrite_stands_behind_the_original() -> None:
 def test_a_draw_lies_where_its_parameters_say() -> None:
     nothing = np.empty((0, 2))
     camera = CameraPerturbation(component="spherical", level=1, azimuth_deg=10, elevation_deg=3, yaw_deg=4, pitch_deg=7)
-    stands, _, turned = coverage.plot_axis("camera", [Draw(BOWL, camera, None)], TestSet(())).panels
+    stands, _, turned = coverage.plot_axis("camera", [KeptPerturbation(BOWL, camera, None)], TestSet(())).panels
     groups = [{"benchmark": nothing, "camera": np.array([at])} for at in ([10.0, 3.0], [4.0, 7.0])]
     assert stands == figures.scatter("where it stands", groups[0], "azimuth (°)", "elevation (°)")
     assert turned == figures.scatter("how it is turned in place", groups[1], "yaw (°)", "pitch (°)")
     offsets_rad = (0.1, 0.2, -0.1, 0.0, 0.05, 0.3, -0.2)
     robot = RobotPerturbation(component="initial_joints", level=1, joint_offsets_rad=offsets_rad)
     rows = {f"joint {n}": {"benchmark": nothing[:, 0], "robot": np.array([x])} for n, x in enumerate(offsets_rad, 1)}
-    *_, joints = coverage.plot_axis("robot", [Draw(BOWL, robot, None)], TestSet(())).panels
+    *_, joints = coverage.plot_axis("robot", [KeptPerturbation(BOWL, robot, None)], TestSet(())).panels
     assert joints == figures.strips("offset by joint, base to wrist", rows, "rad")
 
 

@@ -4,13 +4,17 @@ import json
 import math
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 from conftest import MILK, REPOSITORY
 
-from pipeline.axes import AXES, Axis, Perturbation
+from pipeline.axes import AXES, Axis, Perturbation, from_json
+from pipeline.axes.layout import LayoutAxis
+from pipeline.axes.pose import PoseAxis
+from pipeline.axes.report_data import KeptPerturbation
 from pipeline.config import Config, DemosConfig, PlanConfig, ReplayConfig, load
 from pipeline.export_config import Where
 from pipeline.images.jpeg import encode
@@ -20,6 +24,7 @@ from pipeline.planning.streams import streams_of
 from pipeline.report import seen
 from pipeline.run import manifest
 from pipeline.run.run import Run
+from pipeline.scenes.look import Look
 from pipeline.seeding import rng
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset import benchmark
@@ -68,7 +73,7 @@ def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
     def moved(task: str, number: int, milk: Floats) -> TestTask:
         (milk_x, milk_y), (basket_x, basket_y) = milk, draws[0]["basket_1"]
         moves = f"milk_1:{milk_x},{milk_y};basket_1:{basket_x},{basket_y};ketchup_1:1,1"
-        return TestTask(MILK.suite, task, f"{task}_{number}", "pose", "pose", {"moves": moves})
+        return TestTask(MILK.suite, task, f"{task}_{number}", "pose", "pose", {"moves": moves, "level": 1})
 
     away = np.array([0.006, 0.008])
     test = TestSet(
@@ -80,21 +85,25 @@ def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
         )
     )
     # The milk and the basket of each in turn, and nothing else.
-    assert [cm for _, cm in seen.to_nearest_draw(test, rows)] == pytest.approx([1, 0, 2, 0, 0, 0])
+    moving = [change for row in rows for change in from_json(row.perturbations)]
+    kept: list[KeptPerturbation[Any]] = [KeptPerturbation(MILK, change, None) for change in moving]
+    assert [cm for _, cm in PoseAxis.observe_together(kept, test)] == pytest.approx([1, 0, 2, 0, 0, 0])
     between_cm = 100 * np.linalg.norm(draws[0]["milk_1"] + away - draws[1]["milk_1"] - [[0, 0], 2 * away], axis=1)
-    assert [cm for _, cm in seen.to_nearest_test(test)] == pytest.approx([between_cm.min(), 0, 2, 0, 2, 0])
+    nearest_cm = [cm for what, cm in PoseAxis.observe_tests(test) if what.endswith("to the nearest other (cm)")]
+    assert nearest_cm == pytest.approx([between_cm.min(), 0, 2, 0, 2, 0])
 
 
 def test_what_a_test_shows_is_measured_in_its_own_scene() -> None:
     """0.3 m along x is on the camera's side, from 0.19 m on; the camera stands 0.36 m further, and 0.71 m above."""
     places = {"positions": "0.3,0;-0.1,0.2", "category": "ketchup,ketchup", "arena": "tabletop"}
-    added = [*seen._of_test(TestTask(MILK.suite, MILK.name, "a", "layout", "objects", places))]
-    assert [shown for what, shown in added if what == "layout: object on the camera's side"] == [True, False]
-    away_m = [shown for what, shown in added if what == "layout: object to camera (m)"]
+    added = [*LayoutAxis.observe_tests(TestSet((TestTask(MILK.suite, MILK.name, "a", "layout", "objects", places),)))]
+    assert [shown for what, shown in added if what == "object on the camera's side"] == [True, False]
+    away_m = [shown for what, shown in added if what == "object to camera (m)"]
     assert away_m == pytest.approx([math.hypot(0.36, 0.71), math.hypot(0.76, 0.2, 0.71)])
     moved: dict[str, str | int] = {"moves": "milk_1:0.03,-0.04;basket_1:1,1", "level": 2}
-    ((what, shift_cm),) = seen._of_test(TestTask(MILK.suite, MILK.name, "b", "pose", "pose", moved))
-    assert what == "pose: target of libero_object moved, level 2 (cm)"
+    moves = TestSet((TestTask(MILK.suite, MILK.name, "b", "pose", "pose", moved),))
+    ((what, shift_cm),) = PoseAxis.observe_tests(moves)
+    assert what == "target of libero_object moved, level 2 (cm)"
     assert shift_cm == pytest.approx(5)
 
 
@@ -110,7 +119,7 @@ def test_a_look_has_the_speeds_of_the_hand_and_of_the_fastest_object() -> None:
     )
     at, moving = model.qpos0.copy(), np.zeros(model.nv)
     at[2:4], moving[:2], moving[-6:] = (0.03, -0.01), (0.3, 2.0), (0.3, 0.4, 0, 5, 5, 5)
-    measured = seen.Look.of(model, np.hstack([0.0, at, moving])).measures()
+    measured = seen.clean_measures(Look.of(model, np.hstack([0.0, at, moving])))
     assert [*measured.values()] == pytest.approx([40, 30, 50])
 
 
@@ -120,7 +129,9 @@ def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:
     config = Config.model_validate({"name": "seen", "folder": tmp_path, "demos": demos, "plan": wanted})
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
     plan.write(rows, config.data / "plan.parquet")
-    clean, lighter = (encode(np.full((256, 256, 3), level, np.uint8), config.render) for level in (100, 120))
+    clean, lighter = (
+        encode(np.full((256, 256, 3), level, np.uint8), config.render.jpeg_quality) for level in (100, 120)
+    )
     twins, noisy = (streams_of(row.perturbations) for row in rows)
     view = Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
     state, motion = np.zeros((1, 8), np.float32), np.zeros((1, 7), np.float32)

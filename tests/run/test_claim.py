@@ -54,7 +54,7 @@ def test_a_copy_with_the_old_name_is_refused_before_anything_else(clone: Path) -
 def test_push_refuses_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     claimed(Path("configs/tiny.yaml"))
     shutil.copy("configs/tiny.yaml", "configs/copy.yaml")
-    monkeypatch.setattr(sys, "argv", ["pipeline", "push", "rlds", "somebody/tiny", "configs/copy.yaml"])
+    monkeypatch.setattr(sys, "argv", ["pipeline", "dataset", "push", "rlds", "somebody/tiny", "configs/copy.yaml"])
     assert command_line.main() == 1
     assert "belongs to configs/tiny.yaml" in capsys.readouterr().err
 

@@ -10,13 +10,14 @@ import pytest
 import yaml
 from conftest import run_stages
 
+from pipeline import status
 from pipeline.config import load
 from pipeline.identity import REMAKE
 from pipeline.run import cleaning, dropped, machine, plan_stage
 from pipeline.run.run import Run
 from pipeline.run.work_time import REFERENCE
 from pipeline.stores.frame_store import FrameStore
-from pipeline.validation import doctor, status
+from pipeline.validation import doctor
 
 Change = Callable[[dict[str, Any]], None]
 

@@ -12,12 +12,10 @@ from typing import Any
 import pytest
 from synthetic import IDS, episode, episodes, files, loop
 
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
-from pipeline.formats import lerobot_v21
+from pipeline.formats import lerobot
 from pipeline.formats.base import Format
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export, is_current
 from pipeline.types import Episode
 
@@ -33,7 +31,7 @@ def target(name: str, data: Path) -> Format[Any]:
     if name == "rlds":
         return Rlds(data, RldsConfig(name="synthetic", shards=PIECES))
     if name == "lerobot_v21":
-        lerobot_v21.EPISODES_OF_A_PIECE = len(IDS) // PIECES
+        lerobot.EPISODES_OF_A_PIECE = len(IDS) // PIECES
         return LeRobotV21(data, LeRobotV21Config(name="synthetic", convention="ipec"))
     return LeRobot(data, LeRobotConfig(name="synthetic", shards=PIECES))
 

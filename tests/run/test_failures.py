@@ -12,16 +12,17 @@ import pytest
 from conftest import run_stages, tiny_config
 
 from pipeline.config import load
-from pipeline.files import checksum
-from pipeline.formats.registry import failures_of, places
+from pipeline.files import checksum, read_json
+from pipeline.formats.registry import places
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run import manifest
 from pipeline.run.cleaning import PARTS
+from pipeline.run.layout import DATASETS
 from pipeline.run.run import Run
 from pipeline.stages import write_inputs
 from pipeline.validation.validate import EpisodesJob
 
-STAGES = ("inputs", "render", "export_rlds", "export_lerobot", "manifest", "validate")
+STAGES = ("inputs", "render", "exports", "manifest", "validate")
 
 
 def sums(data: Path) -> dict[str, str]:
@@ -87,7 +88,7 @@ def test_validate_checks_them_and_finds_a_success_among_them(asked: Path, tmp_pa
         succeeded = pa.array([True] * len(table))
         place = table.schema.get_field_index("success")
         pq.write_table(table.set_column(place, table.schema.field("success"), succeeded), file)
-        sets = failures_of(config.data, config.export)
+        sets = config.export.failure_datasets(config.data)
         job = EpisodesJob(Run(config), sets, tmp_path / "cache", frozenset(), ("outcome",))
         found = job([missed[0] | places(sets)[missed[0]["episode_id"]]]).findings
     told = {check: {fault.dataset for fault in faults} for check, faults in found.items() if faults}
@@ -98,19 +99,13 @@ def test_a_damaged_set_of_failures_leaves_the_record_of_the_others(asked: Path, 
     shutil.copytree(asked.parents[1], tmp_path, dirs_exist_ok=True)
     with chdir(tmp_path):
         config = load(Path("configs/tiny.yaml"))
-        (failed,) = (one for one in failures_of(config.data, config.export) if one.name == "rlds")
-        seen_by_dvc = failed.stage_record.read_bytes()
+        (failed,) = (one for one in config.export.failure_datasets(config.data) if one.name == "rlds")
         write_inputs(Run(config))
-        assert json.loads((config.data / "settings.json").read_text())["lost"] == {"rlds": [], "lerobot": []}
+        assert failed.record_file.relative_to(config.data).as_posix() in read_json(config.data / DATASETS)
         next(failed.folder.rglob("*.tfrecord*")).write_bytes(b"damaged")
         write_inputs(Run(config))
         assert not failed.record_file.exists()
-        # By this DVC starts the stage.
-        assert json.loads((config.data / "settings.json").read_text())["lost"] == {
-            "rlds": ["failures/rlds.json"],
-            "lerobot": [],
-        }
-        assert failed.stage_record.read_bytes() == seen_by_dvc
+        assert not (config.data / DATASETS).exists(), "so that DVC starts the exports"
         assert {name for name in PARTS["rlds"].names if (config.data / name).exists()} == {
             "rlds",
             "rlds.json",

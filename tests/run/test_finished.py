@@ -10,7 +10,7 @@ from synthetic import episodes, write_rlds
 
 from pipeline import identity
 from pipeline.config import Config, load
-from pipeline.formats.registry import formats_of
+from pipeline.formats.rlds import Rlds
 from pipeline.run import export
 from pipeline.run.finished import Memory, previews_memory, report_memory, summary_memory, validate_memory
 from pipeline.run.run import Run
@@ -85,7 +85,7 @@ def test_what_found_something_off_is_not_remembered(config: Config) -> None:
 
 
 def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Config) -> None:
-    for one in formats_of(config.data, config.export, config.render.extras):
+    for one in config.export.datasets(config.data, config.render.extras):
         content = {name: (one.folder / name).read_bytes() for name in one.record().files}
         name = max(content, key=lambda name: len(content[name]))
         # As in a copy that has the time of the copying.
@@ -102,14 +102,12 @@ def test_a_finished_dataset_is_made_anew_only_where_that_was_allowed(
 ) -> None:
     target, same = write_rlds(tmp_path), episodes()
     assert not export.outdated(target, same)
-    monkeypatch.setitem(identity.RECIPES, "rlds", identity.RECIPES["rlds"] + 1)
-    identity._parts.cache_clear()
-    number = identity.RECIPES["rlds"]
+    number = Rlds.recipe + 1
+    monkeypatch.setattr(Rlds, "recipe", number)
     assert not export.is_current(target, same)
     files = len(target.record().files)
     assert export.outdated(target, same) == {f"files, made with recipe of rlds {number - 1}, here {number}": files}
     assert not export.outdated(target, episodes(content="other episodes")), "which somebody asked for"
-    identity._parts.cache_clear()
 
 
 def test_a_lost_shard_is_made_again_and_a_damaged_trajectory_once_it_is_moved_away(clone: Path, config: Config) -> None:

@@ -14,11 +14,9 @@ import pytest
 from synthetic import episodes, files
 
 from pipeline.config import Config
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.base import Format
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import _bring_up_to_date, notice_changes
 from pipeline.run.run import Run
 

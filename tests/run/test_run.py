@@ -26,8 +26,7 @@ from pipeline.axes.language import BANK_FILE
 from pipeline.clients import oft
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import LeRobotConfig
-from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig
 from pipeline.images.jpeg import decode
 from pipeline.libero.tasks import find_task
 from pipeline.physics.subtasks import subtasks
@@ -36,7 +35,7 @@ from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import episodes_of
-from pipeline.run.layout import FINISHED, STATISTICS
+from pipeline.run.layout import DATASETS, FINISHED, STATISTICS
 from pipeline.run.run import Run
 from pipeline.stores.trajectory_store import TrajectoryStore
 
@@ -248,21 +247,21 @@ def test_lerobot_v21_is_made_checked_and_described_where_it_is_asked_for(
     manifest_before = (data / "manifest.parquet").read_bytes()
     config = tiny_config(short_demos)
     config["export"]["lerobot_v21"] = {"name": "libero_tiny", "convention": "ipec"}
-    printed = run_stages(tmp_path, config, ["export_lerobot", "manifest", "validate", "recipe", "card"])
+    printed = run_stages(tmp_path, config, ["exports", "manifest", "validate", "recipe", "card"])
     assert "lerobot has these" in printed, "v3.0 stays"
     assert (data / "manifest.parquet").read_bytes() == manifest_before
     sets = {folder.name for folder in (data / "lerobot_v21").iterdir()}
     assert sets == {"libero_tiny_goal", "libero_tiny_object"}
     assert "libero_tiny_goal" in (data / "finetune" / "starvla_data_config.py").read_text()
     assert "`observation.images.wrist_image`" in (data / "card" / "lerobot_v21" / "README.md").read_text()
-    # DVC starts the stage where a dataset is lost that not every run has, by `lost`; v3.0 keeps its record.
+    # DVC starts the exports where a dataset is lost, as their output is missing; v3.0 keeps its record.
     seen_by_dvc = (data / "lerobot.json").read_bytes()
     run_stages(tmp_path, config, ["inputs"])
-    assert json.loads((data / "settings.json").read_text())["lost"]["lerobot"] == []
+    assert json.loads((data / DATASETS).read_text()).keys() == {"rlds.json", "lerobot.json", "lerobot_v21.json"}
     next((data / "lerobot_v21").rglob("*.mp4")).unlink()
     run_stages(tmp_path, config, ["inputs"])
     assert not (data / "lerobot_v21.json").exists()
-    assert json.loads((data / "settings.json").read_text())["lost"] == {"rlds": [], "lerobot": ["lerobot_v21.json"]}
+    assert not (data / DATASETS).exists()
     assert (data / "lerobot.json").read_bytes() == seen_by_dvc
 
 
@@ -298,21 +297,21 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(
     original = file.read_text()
     cases: list[tuple[tuple[str, ...], Any, set[str]]] = [
         # The report quotes the whole configuration, but for where it ran.
-        (("export", "rlds", "shards"), 3, {"export_rlds", "manifest", "validate", "recipe", "card", "report"}),
+        (("export", "rlds", "shards"), 3, {"exports", "manifest", "validate", "recipe", "card", "report"}),
         (
             ("export", "lerobot", "frames"),
             "images",
-            {"export_lerobot", "manifest", "validate", "recipe", "card", "report"},
+            {"exports", "manifest", "validate", "recipe", "card", "report"},
         ),
         (
             ("export", "where"),
             {"level": [0, 1]},
-            {"export_rlds", "export_lerobot", "manifest", "validate", "card"} | {"report"},
+            {"exports", "manifest", "validate", "recipe", "card", "report"},
         ),
         (
             ("export", "lerobot_v21"),
             {"name": "tiny", "convention": "ipec"},
-            {"export_lerobot", "manifest", "validate", "recipe", "card", "report"},
+            {"exports", "manifest", "validate", "recipe", "card", "report"},
         ),
         (("render", "jpeg_quality"), 90, {"render", "report"}),
         (("compute", "workers"), 5, set()),
@@ -336,7 +335,7 @@ def test_a_format_that_takes_language_gets_rewrites_and_subtasks(
 ) -> None:
     monkeypatch.chdir(finished.parents[1])
     config = load(Path("configs/tiny.yaml"))
-    plain = LeRobot(config.data, config.export.lerobot or LeRobotConfig())
+    plain = LeRobot(config.data, config.export.options_for(LeRobot) or LeRobotConfig())
     # Where lerobot is older, reading a configuration refuses it.
     told = LeRobot(config.data, plain.options.model_copy(update={"language": True}))
     episodes, given = (episodes_of(target, Run(config)) for target in (plain, told))

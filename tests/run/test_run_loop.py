@@ -78,13 +78,13 @@ def test_a_stage_that_is_called_alone_makes_again_what_was_deleted(
 ) -> None:
     """As people do after an error names a stage's script; nothing listed the change before."""
     data = Path(shutil.copytree(finished, tmp_path / "data" / "tiny"))
-    cases = {
-        "replay": next((data / "trajectories").glob("*.npz")),
-        "render": next((data / "frames").rglob("*.npz")),
-        "export_rlds": next((data / "rlds").rglob("*.tfrecord*")),
-        "export_lerobot": next((data / "lerobot").rglob("*.mp4")),
-    }
-    for stage, file in cases.items():
+    cases = [
+        ("replay", next((data / "trajectories").glob("*.npz"))),
+        ("render", next((data / "frames").rglob("*.npz"))),
+        ("exports", next((data / "rlds").rglob("*.tfrecord*"))),
+        ("exports", next((data / "lerobot").rglob("*.mp4"))),
+    ]
+    for stage, file in cases:
         before = file.read_bytes()
         file.unlink()
         run_stages(tmp_path, tiny_config(short_demos), [stage])

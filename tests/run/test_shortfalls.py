@@ -9,11 +9,11 @@ import pytest
 import yaml
 from conftest import STAGES, run_stages
 
+from pipeline import status
 from pipeline.config import load
 from pipeline.run import manifest
 from pipeline.run.counts import Target, shortfalls, targets
 from pipeline.run.run import Run
-from pipeline.validation import status
 
 
 def row(axis: str, reason: str, *, wanted: bool = True) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.config import RenderConfig
 from pipeline.stores.frame_store import FrameStore
-from pipeline.types import Geometry, Rendered
+from pipeline.types import Geometry, Jpeg, Rendered
 
 
 def test_only_the_streams_asked_for_and_of_the_same_device_are_taken_over(tmp_path: Path) -> None:
@@ -18,7 +18,7 @@ def test_only_the_streams_asked_for_and_of_the_same_device_are_taken_over(tmp_pa
         np.zeros((1, 8), np.float32),
         motion,
         motion,
-        streams={"seen": [b"frame"], "other": [b"other"]},
+        streams={"seen": [Jpeg(b"frame")], "other": [Jpeg(b"other")]},
         rejected={"black": "too_dark", "bright": "blown_out"},
         geometry={"view": view},
     )

@@ -30,7 +30,7 @@ COUNTS = {
     ("background", "surface"): (140, 147, 158, 168),
     ("background", "theme"): (118, 101, 123, 121),
     ("noise", "motion"): (76, 90, 80, 90),
-    ("noise", "gaussian"): (82, 88, 82, 89),
+    ("noise", "gaussian_blur"): (82, 88, 82, 89),
     ("noise", "zoom"): (56, 77, 67, 88),
     ("noise", "fog"): (52, 71, 60, 89),
     ("noise", "glass"): (85, 96, 90, 93),

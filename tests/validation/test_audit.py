@@ -19,13 +19,10 @@ from synthetic import IDS, NAME, episode, loop
 
 from pipeline.__main__ import main
 from pipeline.axes import AXES
-from pipeline.axes.camera_pose import moved_to
 from pipeline.errors import PipelineError
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.libero.arenas import ARENAS, Arena
 from pipeline.libero.tasks import find_task
 from pipeline.run.export import export
@@ -34,6 +31,7 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Episode, Floats
 from pipeline.validation.audit import Audit, audit
+from pipeline.validation.camera_pose import moved_to
 
 TASK = find_task("libero_goal", "put_the_bowl_on_the_plate")
 OWN_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
@@ -209,7 +207,7 @@ def test_a_pose_is_read_back_as_the_change_that_made_it(arena: Arena) -> None:
 def test_the_command_ends_with_1_where_something_overlaps(
     datasets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["pipeline", "audit", str(datasets / "rlds")])
+    monkeypatch.setattr(sys, "argv", ["pipeline", "dataset", "audit", str(datasets / "rlds")])
     assert main() == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["axes"]["camera"]["overlaps"] == 1

@@ -16,7 +16,8 @@ from pipeline.catalogue import downloads
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import Config, DemosConfig, PlanConfig, load
 from pipeline.errors import PipelineError
-from pipeline.export_config import ExportConfig, LeRobotConfig
+from pipeline.export_config import ExportConfig
+from pipeline.formats.lerobot import LeRobotConfig
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import machine
@@ -150,7 +151,7 @@ def test_what_a_run_has_made_already_needs_no_more_room(monkeypatch: pytest.Monk
         file.truncate(500_000_000)
     assert run_doctor("starter", monkeypatch, free_gb=0.5) == 0
     frames.parents[1].rename(tmp_path / "data" / "starter" / "rlds")
-    of_one = ExportConfig(rlds=None, lerobot=LeRobotConfig(name="libero_starter"))
+    of_one = ExportConfig.model_validate({"rlds": None, "lerobot": LeRobotConfig(name="libero_starter")})
     assert run_doctor("starter", monkeypatch, free_gb=0.3, export=of_one) == 1, "a former set makes no room"
 
 
@@ -167,15 +168,12 @@ def test_memory_is_counted_for_the_workers_that_are_asked_for(
     assert doctor._machine(ComputeConfig(workers=5)).remedy == "set compute.workers to 4"
 
 
-def test_the_configuration_that_params_name_is_looked_at(
+def test_the_command_names_demonstrations_that_are_not_there(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "params.yaml").write_text("run: full\ndata: data\n")
-    (tmp_path / "configs").symlink_to(REPOSITORY / "configs")
-    monkeypatch.setattr(sys, "argv", ["pipeline", "doctor"])
+    monkeypatch.setattr(sys, "argv", ["pipeline", "doctor", str(REPOSITORY / "configs" / "full.yaml")])
     assert command_line.main() == 1
-    # The demonstrations of configs/full.yaml are not in this folder.
     assert "data/demos" in capsys.readouterr().err
 
 

@@ -13,12 +13,10 @@ import pytest
 from synthetic import IDS, SET, episode, write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.errors import PipelineError
-from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.base import Format
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.read_back import Fault
-from pipeline.formats.rlds import Rlds
+from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.types import Scene, Trajectory, Verdict
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS

@@ -21,7 +21,7 @@ STORED: dict[str, list[Any]] = {
     "image": list(episode(IDS[0]).frames["image"]),
     # The disc of the other view is of another grey alone.
     "wrist_image": [
-        encode(np.asarray(cv2.rotate(decode(file), cv2.ROTATE_90_CLOCKWISE), np.uint8), RenderConfig())
+        encode(np.asarray(cv2.rotate(decode(file), cv2.ROTATE_90_CLOCKWISE), np.uint8), RenderConfig().jpeg_quality)
         for file in episode(IDS[0]).frames["image"]
     ],
 }

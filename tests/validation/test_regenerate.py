@@ -51,7 +51,7 @@ def test_identical_from_the_manifest_and_the_demonstration(copy: Path, short_dem
     row = perturbed(copy)
     told = ["--manifest", copy / "manifest.parquet", "--out", tmp_path / "out", "--demos", short_demos]
     done = subprocess.run(
-        [sys.executable, "-m", "pipeline", "regenerate", row["episode_id"], *map(str, told)],
+        [sys.executable, "-m", "pipeline", "dataset", "regenerate", row["episode_id"], *map(str, told)],
         cwd=REPOSITORY,
         # As a user calls it: what renders is found out there.
         env={name: value for name, value in os.environ.items() if "GL" not in name},
@@ -95,7 +95,7 @@ def test_without_the_dataset_it_is_only_made_and_says_so(
 ) -> None:
     shutil.rmtree(copy / "rlds")
     told = ["--manifest", copy / "manifest.parquet", "--out", tmp_path / "out", "--demos", short_demos]
-    command = ["pipeline", "regenerate", perturbed(copy)["episode_id"], *told]
+    command = ["pipeline", "dataset", "regenerate", perturbed(copy)["episode_id"], *told]
     monkeypatch.setattr(sys, "argv", [*map(str, command)])
     assert main() == 0
     shown = capsys.readouterr()

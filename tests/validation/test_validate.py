@@ -19,7 +19,8 @@ from pipeline.compute.pool import loop
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum
-from pipeline.formats import lerobot_video, rlds_write
+from pipeline.formats import rlds_write
+from pipeline.formats.lerobot.write import Video
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.images.jpeg import decode, encode
@@ -50,7 +51,7 @@ def flip_gripper(tree: Tree) -> None:
 def turn_back(tree: Tree) -> None:
     for step in tree["steps"]:
         frame = decode(step["observation"]["image"])
-        step["observation"]["image"] = encode(np.ascontiguousarray(frame[::-1, ::-1]), RenderConfig())
+        step["observation"]["image"] = encode(np.ascontiguousarray(frame[::-1, ::-1]), RenderConfig().jpeg_quality)
 
 
 def freeze(tree: Tree) -> None:
@@ -187,7 +188,7 @@ def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
     video_file = root / "videos" / key / "chunk-000" / f"file-{row[f'videos/{key}/file_index']:03d}.mp4"
     with av.open(str(video_file)) as shown:
         frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
-    with lerobot_video.Video(video_file) as made:
+    with Video(video_file) as made:
         for step, frame in enumerate(frames):
             made.add(np.zeros_like(frame) if begin <= step < end else frame, first=step == 0)
     info = json.loads((root / "meta" / "info.json").read_text())

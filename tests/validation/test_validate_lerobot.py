@@ -18,12 +18,9 @@ from pipeline.compute.pool import loop
 from pipeline.config import Config, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.export_config import LeRobotV21Config
-from pipeline.formats import lerobot_video
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotV21, LeRobotV21Config
+from pipeline.formats.lerobot.write import Video
 from pipeline.formats.read_back import Fault
-from pipeline.formats.registry import formats_of
 from pipeline.run import manifest
 from pipeline.run.export import episodes_of, export
 from pipeline.run.run import Run
@@ -43,8 +40,9 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(finished, folder / "data" / "tiny")
     with chdir(folder):
         config = with_v21(finished)
-        assert config.export.lerobot_v21 is not None
-        target = LeRobotV21(config.data, config.export.lerobot_v21)
+        options = config.export.options_for(LeRobotV21)
+        assert options is not None
+        target = LeRobotV21(config.data, options)
         export(target, episodes_of(target, Run(config)), loop)
     return folder
 
@@ -60,7 +58,7 @@ def checked(version: str, config: Config) -> dict[str, list[Fault]]:
     run = Run(config).resolved()
     data = run.folder
     kept = {row["episode_id"]: row for row in manifest.read(data / "manifest.parquet") if row["kept"]}
-    (target,) = (one for one in formats_of(data, config.export) if one.name == version)
+    (target,) = (one for one in config.export.datasets(data) if one.name == version)
     results = EpisodesJob(run, [target], data, frozenset())(list(kept.values()))
     with suppress(PipelineError):  # An episode says it too.
         for check, fault in target.check(kept, data / "cache"):
@@ -134,7 +132,7 @@ def bleach(root: Path, version: str) -> None:
     for file in root.glob("videos/**/*.mp4"):
         with av.open(str(file)) as video:
             grey = [frame.to_ndarray(format="gray") for frame in video.decode(video=0)]
-        with lerobot_video.Video(file) as again:
+        with Video(file) as again:
             for frame in grey:
                 again.add(np.repeat(frame[..., None], 3, axis=2), first=False)
 
@@ -192,9 +190,10 @@ def test_language_columns_are_held_against_what_was_to_be_written(
 ) -> None:
     shutil.copytree(finished, tmp_path / "data" / "tiny")
     config = load(finished.parent.parent / "configs" / "tiny.yaml")
-    assert config.export.lerobot is not None
+    options = config.export.options_for(LeRobot)
+    assert options is not None
     # Before 0.6, lerobot cannot read it and a configuration that asks for it is refused; here lerobot is not asked.
-    told = config.export.lerobot.model_copy(update={"language": True})
+    told = options.model_copy(update={"language": True})
     config = config.model_copy(update={"export": config.export.model_copy(update={"lerobot": told})})
     monkeypatch.chdir(tmp_path)
     target = LeRobot(config.data, told)

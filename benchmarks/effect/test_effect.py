@@ -10,10 +10,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import episodes
+import evaluation
 import numpy as np
 import pytest
+import results
+import sentences
 import yaml
-from conftest import REPOSITORY, STOVE, link_testset, tiny_config
+from conftest import REPOSITORY, STOVE, link_testset, memory, once, short_demos, tiny_config, whole  # noqa: F401
+from experiment import Experiment, read
 
 from pipeline.__main__ import main
 from pipeline.compute_config import ComputeConfig
@@ -25,15 +30,7 @@ from pipeline.libero.demonstrations import DemoEntry, StarterSource
 from pipeline.libero.tasks import STEP_LIMITS, find_task
 from pipeline.planning.selection import pending
 
-EFFECT = REPOSITORY / "benchmarks" / "effect"
-sys.path.append(str(EFFECT))
-
-import episodes  # noqa: E402
-import evaluation  # noqa: E402
-import results  # noqa: E402
-import sentences  # noqa: E402
-from experiment import Experiment, read  # noqa: E402
-
+EFFECT = Path(__file__).parent
 SHIPPED = EFFECT / "experiment.yaml"
 
 

@@ -1,10 +1,12 @@
-"""Reader of single episodes of LeRobot datasets by pyarrow and PyAV; lerobot itself reads in ``lerobot_check.py``."""
+"""Reader of single episodes of LeRobot datasets, v3.0 and v2.1, by PyArrow and PyAV; lerobot reads in ``check.py``."""
 
 import base64
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,19 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
-from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, LANGUAGE, OBJECT_POSES, camera_column
-from pipeline.formats.lerobot_statistics import QUANTILES, matrix
+from pipeline.formats.lerobot.columns import (
+    EPISODE_ID,
+    INSTANCES,
+    LANGUAGE,
+    OBJECT_POSES,
+    Convention,
+    camera_column,
+    data_path_v21,
+    matrix,
+    video_path_v21,
+)
 from pipeline.formats.read_back import Copy, Statistics, sampled
+from pipeline.formats.stated_statistics import QUANTILES
 from pipeline.types import Episode, Extra, Frame, Geometry
 
 UNREADABLE = (
@@ -285,3 +297,115 @@ def _video(file: Edition) -> av.container.InputContainer:
         _VIDEOS[file] = av.open(str(file.path))
         _VIDEOS[file].streams.video[0].thread_count = 1  # Starting more takes longer than a few frames.
     return _VIDEOS[file]
+
+
+# Version 2.1.
+
+
+NAME_V21, VERSION_V21 = "lerobot_v21", "v2.1"
+
+
+def open_all_v21(folder: Path) -> None:
+    """Read the metadata of every set.
+
+    Raises:
+        PipelineError: when the metadata cannot be read.
+    """
+    for root in sets_v21(folder):
+        with readable(root, VERSION_V21):
+            opened_v21(root)
+
+
+def read_v21(folder: Path, episode_id: str, convention: Convention, extras: tuple[Extra, ...]) -> Copy | None:
+    """Read an episode with these extras, under v3.0's names and with LIBERO's gripper; ``None`` when no set has it.
+
+    Raises:
+        PipelineError: when the episode cannot be read.
+    """
+    for root in sets_v21(folder):
+        with readable(root, VERSION_V21):
+            info, rows, tasks = opened_v21(root)
+            if episode_id in rows:
+                return _copy_v21(root, info, rows[episode_id], tasks, convention, extras)
+    return None
+
+
+def _copy_v21(
+    root: Path,
+    info: Mapping[str, Any],
+    row: Mapping[str, Any],
+    tasks: Mapping[int, str],
+    convention: Convention,
+    extras: tuple[Extra, ...],
+) -> Copy:
+    index = row["episode_index"]
+    stored = pq.read_table(root / data_path_v21(index))
+    refuse_others(stored, row, row["first_step"])
+    instructions = [tasks[task] for task in stored["task_index"].to_pylist()]
+    if row["tasks"] != [instructions[0]]:
+        raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
+    v30_names = {name: v30_name for v30_name, name in convention.names.items()}
+    table = stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
+    made = episode(table, row, instructions[0], extras)
+    if convention.open_is_one:
+        libero_gripper = 1 - 2 * made.action[:, -1:]
+        made = replace(made, action=np.hstack([made.action[:, :-1], libero_gripper]))
+    keys = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
+    videos = {
+        view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"
+    }
+    marks = {name: table[name].to_numpy() for name in MARKS}
+    numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
+    statistics = Statistics(_statistics_v21(root, index), numbers, keys)
+    frames = decoded(table["timestamp"].to_pylist(), videos)
+    return Copy(NAME_V21, made, instructions, frames, marks, {}, statistics=statistics)
+
+
+def _statistics_v21(root: Path, index: int) -> dict[str, Any]:
+    """Read the statistics of an episode's columns in ``meta/episodes_stats.jsonl``."""
+    file = root / "meta" / "episodes_stats.jsonl"
+    with file.open("rb") as lines:
+        lines.seek(_begins(edition(file))[index])
+        line = json.loads(lines.readline())
+    if line["episode_index"] != index:
+        raise ValueError(f"line {index} of {file.name} is of episode {line['episode_index']}")
+    stats: dict[str, Any] = line["stats"]
+    return stats
+
+
+@lru_cache(maxsize=8)
+def _begins(file: Edition) -> list[int]:
+    """Return the offset of each line of a file, in bytes."""
+    with file.path.open("rb") as lines:
+        lengths = [len(line) for line in lines]
+    return [0, *accumulate(lengths)]
+
+
+def sets_v21(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir())
+
+
+def opened_v21(root: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[int, str]]:
+    """Read ``meta/info.json``, each episode's line and provenance by its id, and the tasks by their number."""
+    return _opened_v21(root, max(file.stat().st_mtime_ns for file in (root / "meta").iterdir()))
+
+
+@lru_cache(maxsize=8)
+def _opened_v21(root: Path, modified_ns: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[int, str]]:
+    """Read the result of ``opened_v21``, at a time of the last change."""
+    info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text())
+    rows = read_lines(root / "meta" / "episodes.jsonl")
+    first_step = 0
+    for row in rows:
+        row["first_step"] = first_step
+        first_step += row["length"]
+    provenance = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
+    tasks = {row["task_index"]: row["task"] for row in read_lines(root / "meta" / "tasks.jsonl")}
+    by_id = {}
+    for row, labels in zip(rows, provenance, strict=True):
+        by_id[labels[EPISODE_ID]] = labels | row
+    return info, by_id, tasks
+
+
+def read_lines(file: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in file.read_text().splitlines()]

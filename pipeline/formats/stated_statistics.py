@@ -1,12 +1,9 @@
-"""Comparison of the statistics in LeRobot datasets with the columns and with each other."""
+"""Comparison of the statistics that a dataset states of its columns with the columns; lerobot's, by their names."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 FIGURES = ("count", "mean", "std", "min", "max")
@@ -24,22 +21,12 @@ of the deviation, as a quotient. In 47 episodes of ``configs/starter.yaml`` the 
 views.
 """
 
-ENTRIES = 16
-"""Number of a column's entries that are in memory at a time."""
 
 Stored = Mapping[str, Any]
 """Statistics of one column as they are stored, by name."""
 
 Wrong = Iterator[tuple[str, str]]
 """Differences, each as the stored and the expected value in words."""
-
-
-def matrix(table: pa.Table, column: str) -> NDArray[Any]:
-    """Return the values (T, D) of a column of numbers or of vectors."""
-    values = table[column].combine_chunks()
-    is_list = pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type)
-    flat = values.flatten() if is_list else values
-    return np.asarray(flat.to_numpy(zero_copy_only=False).reshape(len(values), -1))
 
 
 def complete(column: str, stored: Stored, names: Sequence[str], channels: int) -> Wrong:
@@ -58,74 +45,7 @@ def wrong_numbers(column: str, stored: Stored, values: NDArray[Any], quantiles: 
     wanted |= dict(zip(quantiles, np.quantile(exact, shares, axis=0), strict=True))
     wanted["count"] = np.array([len(exact)])
     for name, expected in wanted.items():
-        yield from _unlike(f"{name} of {column}", stored[name], expected)
-
-
-def wrong_in_dataset(stored: Mapping[str, Stored], files: Sequence[Path], columns: Mapping[str, Any]) -> Wrong:
-    """Compare the statistics of all steps with the data files, for every column of numbers.
-
-    Args:
-        stored: column to its stored statistics.
-        files: the data files.
-        columns: the columns as ``meta/info.json`` should describe them.
-    """
-    numbers = {name: of["shape"][0] for name, of in columns.items() if of["dtype"] in ("float32", "int64")}
-    frames = {name for name, of in columns.items() if of["dtype"] in ("image", "video")}
-    if stored.keys() != numbers.keys() | frames:
-        yield f"the statistics have the columns {sorted(stored)}", f"{sorted(numbers.keys() | frames)}"
-    for column, width in (numbers | dict.fromkeys(frames, 3)).items():
-        yield from complete(column, stored.get(column, {}), (*FIGURES, *QUANTILES), width)
-    for column, width in numbers.items():
-        if any(complete(column, stored.get(column, {}), (*FIGURES, *QUANTILES), width)):
-            continue
-        for first in range(0, width, ENTRIES):
-            entries = slice(first, first + ENTRIES)
-            values = np.concatenate([_entries(file, column)[:, entries] for file in files])
-            part = {name: value if name == "count" else value[entries] for name, value in stored[column].items()}
-            yield from wrong_numbers(column, part, values, QUANTILES)
-
-
-def _entries(file: Path, column: str) -> NDArray[Any]:
-    """Read the values (N, D) of a data file's column."""
-    return matrix(pq.ParquetFile(file).read([column], use_threads=False), column)
-
-
-def wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[Any]]) -> Wrong:
-    """Compare a camera's statistics over all frames with the statistics of the episodes.
-
-    Mean, deviation and range follow from the episodes. A quantile must be between the least and the largest quantile of
-    the episodes. Where the episodes state none, as in version 2.1, it must be within the bounds of Cantelli's
-    inequality. Nothing is compared if statistics are missing; ``wrong_in_dataset`` reports that.
-
-    Args:
-        column: the camera's column.
-        stored: its statistics over all frames.
-        episodes: name to the statistics of all episodes, (episodes, 3), of the count (episodes, 1).
-    """
-    if any(complete(column, stored, (*FIGURES, *QUANTILES), 3)):
-        return
-    frames = episodes["count"]
-    mean = (frames * episodes["mean"]).sum(axis=0) / frames.sum()
-    spread = episodes["std"] ** 2 + (episodes["mean"] - mean) ** 2
-    wanted = {
-        "count": frames.sum(axis=0),
-        "mean": mean,
-        "std": np.sqrt((frames * spread).sum(axis=0) / frames.sum()),
-        "min": episodes["min"].min(axis=0),
-        "max": episodes["max"].max(axis=0),
-    }
-    for name, expected in wanted.items():
-        yield from _unlike(f"{name} of {column}", np.ravel(stored[name]), expected)
-    mean, std = wanted["mean"], wanted["std"]
-    for name in QUANTILES:
-        levels, share = np.ravel(stored[name]), int(name[1:]) / 100
-        least, most = mean - std * np.sqrt((1 - share) / share), mean + std * np.sqrt(share / (1 - share))
-        if name in episodes:
-            least, most = episodes[name].min(axis=0), episodes[name].max(axis=0)
-        if not ((levels >= least - SAME) & (levels <= most + SAME)).all():
-            statement = f"{name} of {column} is {levels.tolist()} in the statistics"
-            yield statement, f"from {least.tolist()} to {most.tolist()}, as follows from those of the episodes"
-    yield from _disordered(column, stored)
+        yield from unlike_figures(f"{name} of {column}", stored[name], expected)
 
 
 def wrong_pixels(column: str, stored: Stored, levels: NDArray[np.int64], quantiles: Sequence[str]) -> Wrong:
@@ -136,7 +56,7 @@ def wrong_pixels(column: str, stored: Stored, levels: NDArray[np.int64], quantil
         share = int(name[1:]) / 100
         wanted[name] = np.array([values[np.argmax(channel >= share)] for channel in shares])
     for name, expected in wanted.items():
-        yield from _unlike(f"{name} of {column}", np.ravel(stored[name]), expected)
+        yield from unlike_figures(f"{name} of {column}", np.ravel(stored[name]), expected)
 
 
 def wrong_sample(column: str, stored: Stored, levels: NDArray[np.int64], steps: int) -> Wrong:
@@ -160,7 +80,7 @@ def wrong_sample(column: str, stored: Stored, levels: NDArray[np.int64], steps: 
     if not ((figures["std"] * DEVIATION >= std) & (figures["std"] <= std * DEVIATION)).all():
         statement = f"std of {column} is {figures['std'].tolist()} in the statistics"
         yield statement, f"{std.tolist()} within a factor of {DEVIATION:g}"
-    yield from _disordered(column, stored)
+    yield from disordered(column, stored)
 
 
 def _of_levels(levels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
@@ -175,7 +95,7 @@ def _of_levels(levels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     }
 
 
-def _disordered(column: str, stored: Stored) -> Wrong:
+def disordered(column: str, stored: Stored) -> Wrong:
     """Compare the order of the range and the quantiles."""
     names = [name for name in ("min", *QUANTILES, "max") if name in stored]
     figures = np.array([np.ravel(stored[name]) for name in names])
@@ -183,7 +103,8 @@ def _disordered(column: str, stored: Stored) -> Wrong:
         yield f"{', '.join(names)} of {column} are not in order: {figures.tolist()}", "each at least the one before"
 
 
-def _unlike(what: str, stored: Any, expected: NDArray[Any]) -> Wrong:
+def unlike_figures(what: str, stored: Any, expected: NDArray[Any]) -> Wrong:
+    """Compare stored figures with expected ones, within ``SAME_SHARE`` and ``SAME``."""
     values = np.asarray(stored, float)
     if values.shape != expected.shape or not np.allclose(values, expected, rtol=SAME_SHARE, atol=SAME):
         yield f"{what} is {values.tolist()} in the statistics", f"{expected.tolist()}"

@@ -7,10 +7,10 @@ from conftest import BOWL
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
+from pipeline.status import not_made
 from pipeline.stores.frame_store import StoredFrames
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
-from pipeline.validation.status import not_made
 
 
 def test_what_is_left_is_counted_in_trajectories_and_streams() -> None:

@@ -1,8 +1,17 @@
-"""Columns of LeRobot datasets: of v3.0, and of v2.1 in the conventions in use. This module is light to import."""
+"""Layout of LeRobot datasets: columns, files and video encoding of v3.0, and of v2.1 in the conventions in use.
+
+This module is light to import.
+"""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, MatrixSpec, PosesSpec
 from pipeline.formats.base import StepSizes
@@ -19,6 +28,9 @@ INSTANCES, OBJECT_POSES = "instances", "object_poses"
 """Columns of extras: a JSON list of names in ``meta/provenance.parquet``, and the poses of the named objects in every
 frame."""
 
+ENTRIES = 16
+"""Number of a column's entries that are in memory at a time: 300 MB for 28,000 episodes."""
+
 FILE_MB = 200
 """Approximate largest size of a file of data or video."""
 
@@ -33,6 +45,59 @@ LANGUAGE = "language_persistent"
 
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """lerobot's own columns of every frame, in addition to ``timestamp``."""
+
+ENCODER: Final = "libx264"
+ENCODER_OPTIONS = {
+    # Measured on LIBERO frames (benchmarks/video_quality.py): 40 dB to the stored JPEG files in both views at 6.7 kB a
+    # frame, a third of theirs, no frame below 37 dB. "superfast" saves a tenth of the bytes for twice the time.
+    "preset": "ultrafast",
+    # The quantiser is fixed: 22, and 19 for key frames. A "crf" of 20 chooses it for each frame. Its files have equal
+    # size and mean quality, but single frames of 35 dB, and take a third more time.
+    "qp": "22",
+    # lerobot's own choice: any frame is at most one frame away from a key frame, for random access in training.
+    "g": "2",
+    # The first frame of an episode does not depend on the episode before.
+    "forced-idr": "1",
+    # The bytes depend on the number of threads; files are written in parallel already.
+    "threads": "1",
+}
+VIDEO_INFO = {
+    "video.height": SCHEMA.frame.shape[0],
+    "video.width": SCHEMA.frame.shape[1],
+    "video.channels": SCHEMA.frame.shape[2],
+    "video.codec": "h264",
+    "video.pix_fmt": "yuv420p",
+    "video.is_depth_map": False,
+    "video.fps": SCHEMA.fps_hz,
+    "has_audio": False,
+    # lerobot 0.6 encodes with these settings where an edit cuts a file. Without them it uses B-frames and cannot merge
+    # its own files. It does not support "qp".
+    "video.g": int(ENCODER_OPTIONS["g"]),
+    "video.crf": 20,
+    "video.preset": ENCODER_OPTIONS["preset"],
+}
+"""Properties of these files in ``meta/info.json``."""
+
+FILES_OF_A_CHUNK = 1000
+"""Files in a folder of data or videos; lerobot's own value, which its tools for editing continue to use."""
+
+PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH, VIDEO_PATH = f"data/{PLACE}.parquet", f"videos/{{video_key}}/{PLACE}.mp4"
+"""Paths of v3.0 below the dataset's root, lerobot's own."""
+
+DATA_PATH_V21 = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+VIDEO_PATH_V21 = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+"""Paths of v2.1 below a set's root: each episode has files of its own."""
+
+
+def data_path_v21(index: int) -> str:
+    """Return the path of an episode's data below the root of its set of v2.1."""
+    return DATA_PATH_V21.format(episode_chunk=index // FILES_OF_A_CHUNK, episode_index=index)
+
+
+def video_path_v21(index: int, key: str) -> str:
+    """Return the path of an episode's video below the root of its set of v2.1."""
+    return VIDEO_PATH_V21.format(episode_chunk=index // FILES_OF_A_CHUNK, episode_index=index, video_key=key)
 
 
 def camera_column(view: str, name: str) -> str:
@@ -53,6 +118,19 @@ def _flat(spec: PosesSpec) -> dict[str, Any]:
     rows, columns = spec.shape
     names = [f"{row}_{name}" for row in range(rows) for name in spec.names]
     return {"dtype": spec.dtype, "shape": (rows * columns,), "names": names}
+
+
+def matrix(table: pa.Table, column: str) -> NDArray[Any]:
+    """Return the values (T, D) of a column of numbers or of vectors."""
+    values = table[column].combine_chunks()
+    is_list = pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type)
+    flat = values.flatten() if is_list else values
+    return np.asarray(flat.to_numpy(zero_copy_only=False).reshape(len(values), -1))
+
+
+def read_matrix(file: Path, column: str) -> NDArray[Any]:
+    """Read the values (N, D) of a data file's column."""
+    return matrix(pq.ParquetFile(file).read([column], use_threads=False), column)
 
 
 @dataclass(frozen=True)
@@ -85,7 +163,7 @@ class Convention:
         return frames_kb + IN_TEXT * views * sizes.maps_kb + sizes.poses_kb
 
     def columns(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
-        """Describe the columns of every frame, as ``meta/info.json`` does."""
+        """Describe the columns of every frame, without the encoding of videos."""
         frame = {"dtype": "video", "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
         if self.frames == "images":
             frame["dtype"] = "image"
@@ -104,6 +182,14 @@ class Convention:
         columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}
         columns |= {name: dict(number) for name in COUNTERS}
         return {self.name(column): description for column, description in columns.items()}
+
+    def described(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
+        """Describe the columns as ``meta/info.json`` does, videos with the properties of their encoding."""
+        columns = {}
+        for name, description in self.columns(extras).items():
+            encoding = {"info": VIDEO_INFO} if description["dtype"] == "video" else {}
+            columns[name] = {**description, **encoding}
+        return columns
 
 
 CONVENTIONS = {

@@ -1,13 +1,14 @@
 """What the experiment's tables say: rows as they were written, paired differences, exact p-values, and the pages."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import comparison
 import numpy as np
 import pytest
+import results
 from conftest import REPOSITORY
 from episode_results import result
 from scipy.stats import permutation_test
@@ -16,11 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 
-EFFECT = REPOSITORY / "benchmarks" / "effect"
-sys.path.append(str(EFFECT))
-
-import comparison  # noqa: E402
-import results  # noqa: E402
+EFFECT = Path(__file__).parent
 
 
 def row(axis: str, number: int, success: bool, policy: str) -> EpisodeResult:
@@ -92,12 +89,12 @@ def test_p_is_exact_where_few_tests_differ() -> None:
 
 
 def test_the_page_shows_what_the_committed_rows_say(tmp_path: Path) -> None:
-    docs = REPOSITORY / "docs"
-    for name in ("effect.md", "decisions.md"):
-        (tmp_path / name).write_text((docs / name).read_text())
-    comparison.publish(EFFECT / "results", tmp_path)
-    for name in ("effect.md", "effect.svg", "decisions.md"):
-        assert (tmp_path / name).read_bytes() == (docs / name).read_bytes(), "python benchmarks/effect table"
+    docs, log = REPOSITORY / "docs", REPOSITORY / "benchmarks" / "LOG.md"
+    for page in (docs / "effect.md", log):
+        (tmp_path / page.name).write_text(page.read_text())
+    comparison.publish(EFFECT / "results", tmp_path, tmp_path / log.name)
+    for page in (docs / "effect.md", docs / "effect.svg", log):
+        assert (tmp_path / page.name).read_bytes() == page.read_bytes(), "python benchmarks/effect table"
 
 
 def test_the_plot_of_the_page_is_the_same_each_time(tmp_path: Path) -> None:

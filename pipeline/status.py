@@ -2,34 +2,22 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
+from pipeline import stages
 from pipeline.config import Config
 from pipeline.errors import PipelineError
-from pipeline.files import read_json
 from pipeline.generated import FOLDERS, edits, edits_in_words
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
-from pipeline.run import cleaning, counts, dropped, export, finished, inputs, machine, outcome, plan_stage
-from pipeline.run.layout import CARD, COUNTS, FINETUNE, INPUTS, LEAKAGE, MACHINE, MANIFEST, SETTINGS, STATISTICS
+from pipeline.run import cleaning, counts, dropped, export, finished, machine, outcome, plan_stage
 from pipeline.run.outcome import outdated
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import StoredFrames, frames_by_trajectory
 from pipeline.types import Verdict
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
-
-MADE = {
-    "doctor": [MACHINE],
-    "leakage": [LEAKAGE],
-    "manifest": [MANIFEST, COUNTS, STATISTICS],
-    "recipe": [FINETUNE],
-    "card": [CARD],
-}
-"""Outputs of the stages that keep no record of their inputs, by stage."""
 
 
 def told(run: Run) -> Iterator[str | Table]:
@@ -102,10 +90,9 @@ def _steps(
         yield "plan", "there is no plan yet"
         return
     config = run.config
-    files_changed = bool(_changed(run.path(INPUTS), inputs.listing(config)))
-    of_plan = files_changed or not plan_stage.is_up_to_date(run)
-    if of_plan:
-        yield "plan", _why_planned(run)
+    why_planned = stages.why_not("plan", run)
+    if why_planned is not None:
+        yield "plan", why_planned
     made_anew = outdated(rows, run.trajectories, run.frames)
     needed = selection.pending(rows, verdicts, rejected)
     if needed:
@@ -116,24 +103,37 @@ def _steps(
     missing = [row for row in to_render if not outcome.rendered(row, frames)]
     if missing:
         yield "render", f"the frames of {len(missing)} episodes are not there" + _of(made_anew, "files of frames")
-    if needed or missing or of_plan:
+    if needed or missing or why_planned is not None:
         yield "exports and all that follows", "their episodes are not all there" if needed or missing else "a new plan"
         return
     yield from _follow(run)
 
 
 def _follow(run: Run) -> Iterator[tuple[str, str]]:
-    for stage, names in MADE.items():
-        gone = [name for name in names if not run.path(name).exists()]
-        if gone:
-            yield stage, f"{gone[0]} is not there"
-        elif any(edits(run.path(name)) for name in names if name in FOLDERS):
-            yield stage, "stops before it overwrites edits"
-        elif stage == "card":
-            statements = _changed_statements(run)
-            if statements:
-                yield stage, f"another configuration: {', '.join(statements)}"
-    stale = False
+    """Yield the stages that would work although every wanted trajectory and frame is stored."""
+    yield from _outdated(run, ("doctor", "leakage"))
+    stale = list(_stale_datasets(run))
+    yield from stale
+    if stale:
+        yield "manifest and all that follows", "the datasets are not those"
+        return
+    yield from _outdated(run, ("manifest", "recipe", "card"))
+    for memory in (finished.validate_memory(run), finished.summary_memory(run), finished.report_memory(run)):
+        changed = memory.why_not()
+        if changed is not None:
+            yield memory.stage, changed
+
+
+def _outdated(run: Run, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+    for name in names:
+        changed = stages.why_not(name, run)
+        if changed is None:
+            continue
+        edited = any(edits(run.path(folder)) for folder in FOLDERS if folder in stages.STAGES[name].outputs)
+        yield name, "stops before it overwrites edits" if edited else changed
+
+
+def _stale_datasets(run: Run) -> Iterator[tuple[str, str]]:
     for dataset in (*run.formats, *(run.failure_formats if run.outcome.missed else ())):
         episodes = export.episodes_of(dataset, run)
         if not export.untouched(dataset):
@@ -143,48 +143,7 @@ def _follow(run: Run) -> Iterator[tuple[str, str]]:
             why = f"the dataset has {reason}"
         else:
             continue
-        yield f"export_{dataset.stage_record.stem}", f"{dataset.title}: {why}"
-        stale = True
-    if stale:
-        yield "manifest and all that follows", "the datasets are not those"
-        return
-    for memory in (finished.validate_memory(run), finished.summary_memory(run), finished.report_memory(run)):
-        changed = memory.why_not()
-        if changed is not None:
-            yield memory.stage, changed
-
-
-def _why_planned(run: Run) -> str:
-    changed = _changed(run.path(SETTINGS), inputs.settings(run.config))
-    of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
-    files = sorted(_changed(run.path(INPUTS), inputs.listing(run.config)))
-    if files:
-        of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
-    # The stage `inputs` wrote the new settings down before a plan was rejected.
-    return f"another configuration: {', '.join(of_plan)}" if of_plan else "made from other settings, files or versions"
-
-
-def _changed_statements(run: Run) -> list[str]:
-    """List the fields of the section ``publish`` that have changed since the card was generated."""
-    changed = _changed(run.path(SETTINGS), inputs.settings(run.config))
-    return [name for name in changed if name.split(".")[0] == "publish"]
-
-
-def _changed(file: Path, now: Mapping[str, Any]) -> list[str]:
-    """List the names whose values differ from the file's; without a file, the list is empty."""
-    try:
-        before = read_json(file)
-    except PipelineError:
-        return []
-    return list(_differences(before, now))
-
-
-def _differences(before: Any, now: Any, field: str = "") -> Iterator[str]:
-    if isinstance(before, dict) and isinstance(now, dict):
-        for name in dict.fromkeys([*before, *now]):
-            yield from _differences(before.get(name), now.get(name), f"{field}.{name}".removeprefix("."))
-    elif before != now:
-        yield field
+        yield f"export_{dataset.group}", f"{dataset.title}: {why}"
 
 
 def _of(made_anew: Counter[str], what: str) -> str:
@@ -225,7 +184,9 @@ def not_made(
     streams = set()
     for row in needed:
         streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations).values()}
-    rendered = {(trajectory, stream) for trajectory, shown in frames.items() for stream in shown.streams}
+    rendered = set()
+    for trajectory, shown in frames.items():
+        rendered |= {(trajectory, stream) for stream in shown.streams}
     return {
         "replay": len(trajectories - verdicts.keys()) / len(trajectories),
         "render": len(streams - rendered) / len(streams),

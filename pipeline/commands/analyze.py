@@ -1,0 +1,180 @@
+"""Group ``analyze``: commands about results of policies and about runs. Each prints one line of JSON last."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pipeline.commands.base import PATH, Command, LazyGroup, Listed, config_argument, open_run
+from pipeline.errors import PipelineError
+from pipeline.files import refuse_other_file, write_json
+
+analyze = LazyGroup(
+    "analyze",
+    help="Report on results of policies, and compare runs with the test tasks.",
+    sections={
+        "Commands": {
+            "report": Listed("analyze", "Write an HTML page and a JSON file about evaluations."),
+            "coverage": Listed("analyze", "Compare the observations of a run with those of the test tasks."),
+            "gap": Listed("analyze", "Measure the compositional gap of pairs of perturbations."),
+            "construct": Listed("analyze", "Sample and balance a benchmark of held-out perturbations."),
+            "grade": Listed("analyze", "Grade the difficulty of tasks by the models that solve them."),
+            "leakage": Listed("analyze", "Measure how close held-out perturbations come to a run's plan."),
+        }
+    },
+)
+
+results_argument = click.argument("results", metavar="DIR", type=PATH, help="Folder of the results.")
+
+
+@click.command(cls=Command)
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=PATH, help="Folders of results.")
+@click.option(
+    "--across",
+    multiple=True,
+    type=click.Choice(("prompt", "step_limit", "black")),
+    help="Compare results that differ in this, which is rejected otherwise; may be given several times.",
+)
+@click.option(
+    "--out",
+    metavar="FILE",
+    type=PATH,
+    default=Path("report.html"),
+    help="Page to write, with a JSON file next to it (default: report.html).",
+)
+def report(folders: tuple[Path, ...], across: tuple[Any, ...], out: Path) -> None:
+    """Write an HTML page and a JSON file about evaluations: rates, the paper's table, comparisons, failures.
+
+    The folders are results of `evaluate`, from one machine or several, and of different policies. Two different results
+    of one episode are an error, and so are results under different prompts, step limits, black views or starts. The
+    last line is JSON.
+    """
+    from pipeline.evaluation.results import read
+    from pipeline.report import evaluation_report
+
+    print(json.dumps(evaluation_report.write(read(folders, across), out)))
+
+
+@click.command(cls=Command)
+@config_argument
+def coverage(config: Path) -> None:
+    """Compare the observations of a finished run with those of the benchmark's test tasks.
+
+    The measures are, axis by axis: first observations, displacements of hand and targets, places of added objects,
+    changed shares of a view, grey levels and words. The last line is JSON: number, tenth, fiftieth and ninetieth
+    percentile of each measure.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from pipeline.report import seen
+    from pipeline.testset import benchmark
+
+    measures = seen.measure(open_run(config), benchmark.load())
+    table = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
+    table.caption = "A run adds each number of objects equally often, unless it is configured otherwise."
+    figures: dict[str, Any] = {}
+    for measure in measures:
+        cells = ["-" if spread is None else str(spread) for spread in (measure.tested, measure.ours)]
+        table.add_row(measure.axis, measure.what, *cells)
+        figures[f"{measure.axis}: {measure.what}"] = {"tests": measure.tested, "run": measure.ours}
+    Console().print(table)
+    print(json.dumps(figures))
+
+
+@click.command(cls=Command)
+@results_argument
+def gap(results: Path) -> None:
+    """Measure the compositional gap of pairs, results of --source pairs, into gap.json and gap.png in their folder."""
+    from pipeline.evaluation import composition
+    from pipeline.evaluation.results import stored
+
+    picture, findings = results / "gap.png", results / "gap.json"
+    refuse_other_file(picture, composition.TITLE)
+    refuse_other_file(findings, "papers_chi_square")
+    measured = composition.pairs(stored([results]))
+    composition.heatmap(measured, picture)
+    figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
+    write_json(findings, figures)
+    print(json.dumps(figures))
+
+
+@click.command(cls=Command)
+@click.option("--out", metavar="FILE", type=PATH, required=True, help="List of tasks to write.")
+@click.option("--size", metavar="N", type=click.IntRange(min=1), help="Tasks of the benchmark (default: 10,000).")
+@click.option(
+    "--results", metavar="DIR", multiple=True, type=PATH, help="Results of candidates; may be given several times."
+)
+@click.option(
+    "--trained-on", metavar="CONFIG", type=PATH, help="Leave out perturbations that overlap with the plan of this run."
+)
+@click.option("--seed", type=int, default=0, help="Seed of all perturbations (default: 0).")
+def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on: Path | None, seed: int) -> None:
+    """Sample 14,000 held-out perturbations as candidates, and filter and balance them to a benchmark.
+
+    The file is for `evaluate --tasks-from`. Some scenes reject their perturbation, which shows only when candidates are
+    run: with --results, those tasks are left out.
+    """
+    from pipeline.evaluation import own_draws, selection
+    from pipeline.evaluation.results import stored
+    from pipeline.evaluation.task_list import refuse_other_list, write_tasks
+
+    refuse_other_list(out)
+    rows = [row for row, _ in stored(results)]
+    plan = own_draws.planned(open_run(trained_on).plan_file) if trained_on else None
+    candidates = selection.candidates(seed)
+    chosen, counts = selection.construct(candidates, seed, size or selection.SIZE, rows, plan)
+    write_tasks(chosen, seed, out)
+    print(json.dumps(counts))
+
+
+@click.command(cls=Command)
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=PATH, help="Results of one model each.")
+@click.option("--out", metavar="FILE", type=PATH, required=True, help="List of tasks with their difficulty.")
+def grade(folders: tuple[Path, ...], out: Path) -> None:
+    """Grade the difficulty of tasks, 1 to 5, by how many of several models solve each."""
+    from pipeline.evaluation import statistics
+    from pipeline.evaluation.results import stored
+    from pipeline.evaluation.task_list import refuse_other_list, write_tasks
+
+    refuse_other_list(out)
+    results = [stored([folder]) for folder in folders]
+    seeds: set[int] = set()
+    for results_of_model in results:
+        seeds.update(row.seed for row, _ in results_of_model)
+    seed, *further_seeds = sorted(seeds)
+    if further_seeds:
+        raise PipelineError(f"results of seeds {sorted(seeds)}", expected="one seed, and so the same draws")
+    graded = statistics.grade(results)
+    write_tasks(graded, seed, out)
+    difficulties = [task["difficulty"] for task in graded]
+    by_level = {level: difficulties.count(level) for level in range(1, 6)}
+    print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
+
+
+@click.command(cls=Command)
+@results_argument
+@config_argument
+def leakage(results: Path, config: Path) -> int:
+    """Measure how close the held-out perturbations of results come to the plan of a run.
+
+    The exit status is 1 if one overlaps.
+    """
+    from pipeline.axes import from_json
+    from pipeline.evaluation import own_draws
+    from pipeline.evaluation.results import stored
+    from pipeline.libero.tasks import find_task
+
+    perturbations = []
+    for row, _ in stored([results]):
+        if row.source != "own":
+            continue
+        for perturbation in from_json(json.dumps(row.perturbations)):
+            perturbations.append((row.name, perturbation, find_task(row.suite, row.base)))
+    if not perturbations:
+        lacking = "there are no held-out perturbations"
+        raise PipelineError(lacking, where=results, remedy="evaluate --source own")
+    findings = own_draws.compare(perturbations, own_draws.planned(open_run(config).plan_file))
+    print(json.dumps(findings))
+    return int(any(finding["overlaps"] for finding in findings.values()))

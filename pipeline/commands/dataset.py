@@ -1,0 +1,168 @@
+"""Group ``dataset``: commands about the datasets of a finished run, or about one of another origin."""
+
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pipeline.commands.base import PATH, Command, LazyGroup, Listed, OneOf, config_argument, open_run
+from pipeline.errors import PipelineError
+
+dataset = LazyGroup(
+    "dataset",
+    help="Check, audit, regenerate or push a dataset.",
+    sections={
+        "Commands": {
+            "check": Listed("dataset", "Compare all files of a run with their checksums."),
+            "audit": Listed("dataset", "Measure how close any dataset comes to the test tasks."),
+            "regenerate": Listed("dataset", "Generate one episode again, and compare it byte for byte."),
+            "push": Listed("dataset", "Upload a dataset with its card to the Hugging Face hub."),
+        }
+    },
+)
+
+
+@click.command(cls=Command)
+@config_argument
+def check(config: Path) -> int:
+    """Compare all files of a run with their checksums, and read its RLDS sets as OpenVLA-OFT does.
+
+    Files that differ from what was written are listed, and so is all that would mislead OpenVLA-OFT's training. The
+    last line is JSON. The exit status is 1 if something is listed: move a damaged file away, and the run generates it
+    again. (The stage validate, a part of every run, compares the datasets with each other and with the plan.)
+    """
+    from pipeline.clients import oft
+    from pipeline.run.layout import STATISTICS
+    from pipeline.validation.verify import verify
+
+    run = open_run(config)
+    with run.workers() as workers:
+        stored = verify(run, workers)
+    damaged: list[str] = []
+    for findings in stored.values():
+        damaged += findings["damaged"]
+    trained: dict[str, Any] = {}
+    # OpenVLA-OFT's reader stops at damaged files.
+    if "rlds" in run.config.export.formats and not stored["rlds"]["damaged"]:
+        trained = oft.check_all(run.dataset("rlds").folder, run.path(STATISTICS))
+    misleading: list[str] = []
+    for name, findings in trained.items():
+        misleading += [f"{name}: {violation}" for violation in findings["violations"]]
+    for line in (*damaged, *misleading):
+        print(line)
+    print(json.dumps({**stored, "openvla_oft": trained}))
+    return int(bool(damaged or misleading))
+
+
+@click.command(cls=Command)
+@click.argument("dataset", metavar="DATASET", type=PATH, help="Folder of an RLDS or LeRobot set of any origin.")
+@click.option(
+    "--manifest", metavar="FILE", type=PATH, help="Labels of episodes that lost theirs and kept their episode_id."
+)
+def audit(dataset: Path, manifest: Path | None) -> int:
+    """Measure how close a dataset comes to the test tasks of the benchmark.
+
+    The instruction of every episode is compared, and also the matrices of its agent view and the labels of this
+    project if the dataset has them, even after it was edited, merged or filtered. Episodes that cannot be compared are
+    counted. The last line is JSON. The exit status is 1 if an episode overlaps with a test task.
+    """
+    from dataclasses import asdict
+
+    import rich
+
+    from pipeline.planning import leakage
+    from pipeline.testset import benchmark
+    from pipeline.validation import audit
+
+    result = audit.audit(dataset, benchmark.load(), manifest)
+    rich.print(leakage.report(result.axes))
+    for axis, number in result.unknown.items():
+        print(f"{axis}: not known of {number:,} of {result.episodes:,} episodes: no labels, no text, or no known task")
+    print(json.dumps(asdict(result) | {"unknown": result.unknown}))
+    return int(any(finding.overlaps for finding in result.axes.values()))
+
+
+@click.command(cls=Command)
+@click.argument("episode_id", metavar="EPISODE_ID", help="Identifier as in the manifest and in the datasets.")
+@click.argument(
+    "config",
+    metavar="[CONFIG]",
+    required=False,
+    type=PATH,
+    help="File of the run's configuration; without it, give --manifest.",
+)
+@click.option("--out", metavar="DIR", type=PATH, required=True, help="New folder for the regenerated episode.")
+@click.option("--manifest", metavar="FILE", type=PATH, help="Manifest of a dataset without a run.")
+@click.option(
+    "--demos",
+    metavar="DIR",
+    type=PATH,
+    help="With --manifest: the HDF5 demonstrations that the dataset was generated from.",
+)
+def regenerate(episode_id: str, config: Path | None, out: Path, manifest: Path | None, demos: Path | None) -> int:
+    """Generate one episode again from the manifest and its demonstration, and compare it byte for byte.
+
+    The episode is replayed, rendered and serialised again. The last line is JSON: whether it equals the record in the
+    RLDS set next to the manifest, which columns differ, and which versions and OpenGL device are not those of the
+    manifest. The exit status is 1 if it is not identical.
+    """
+    from pipeline.validation import regenerate
+
+    if manifest is None and config is None:
+        raise click.UsageError("Missing argument 'CONFIG', or option '--manifest'.")
+    if (manifest is None and demos is not None) or (manifest is not None and config is not None):
+        raise PipelineError(
+            "two places to take the demonstrations from", where="options", expected="CONFIG, or --manifest and --demos"
+        )
+    if config is not None:
+        run = open_run(config)
+        manifest, demos = run.manifest_file, run.config.demos.root
+    assert manifest is not None
+    result = regenerate.regenerate(episode_id, manifest, out, demos)
+    if result["identical"] is None:
+        print(f"only made, in {out}: no RLDS set lies beside {manifest} to compare it with", file=sys.stderr)
+    print(json.dumps(result))
+    return int(result["identical"] is False or result["reason"] != "kept")
+
+
+def _formats() -> Iterable[str]:
+    from pipeline.formats.registry import FORMATS
+
+    return [kind.name for kind in FORMATS]
+
+
+@click.command(cls=Command)
+@click.argument("format_name", metavar="FORMAT", type=OneOf(_formats), help="Format of the dataset, such as lerobot.")
+@click.argument("repository", metavar="REPOSITORY", help="Repository <owner>/<name> on the hub.")
+@config_argument
+@click.option("--really", is_flag=True, help="Upload.")
+@click.option("--private", is_flag=True, help="Create a private repository; reject a public one.")
+@click.option("--replace", is_flag=True, help="Delete all but an earlier upload of the same run and format.")
+def push(format_name: str, repository: str, config: Path, really: bool, private: bool, replace: bool) -> None:
+    """Upload a run's dataset with its card to the Hugging Face hub; without --really, list what would be uploaded.
+
+    One dataset of a finished and validated run is uploaded in one commit: its files, the card, the manifest and
+    finetune/. Files must be as recorded. A repository with anything but an earlier upload of the same run and format
+    is rejected. An upload that was stopped resumes. A token is read from HF_TOKEN or `hf auth login`, the address of
+    another hub from HF_ENDPOINT.
+    """
+    run = open_run(config)
+    if format_name not in run.config.export.formats:
+        raise PipelineError(
+            f"the run has no {format_name}",
+            where=f"export.{format_name}",
+            expected=" or ".join(run.config.export.formats),
+        )
+    from pipeline.publish import push
+
+    upload = push.prepare(run.dataset(format_name), run)
+    print(upload.summary())
+    options = {"private": private, "replace": replace}
+    if really:
+        print(push.send(upload, repository, **options))
+        return
+    print(push.compare(upload, repository, **options))
+    print(f"nothing was sent: with --really this goes to {repository}")

@@ -1,0 +1,181 @@
+"""Commands before a run: ``doctor``, ``axes``, ``tasks``, ``preview``, ``sources`` and ``rewrite``."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import click
+
+from pipeline.commands.base import PATH, Command, OneOf, config_argument, load_config
+
+PREVIEW = "perturbed-demos: preview"
+"""Comment in the pictures of `preview`, which marks files that it may overwrite."""
+
+EVERY = "all"
+"""Argument in place of an axis, for one picture of each axis."""
+
+DEFAULTS = {"name": "preview", "plan": {"episodes": {}}}
+"""Configuration of a preview without a file: the starter demonstrations and default ranges."""
+
+
+@click.command(cls=Command)
+@config_argument
+def doctor(config: Path) -> int:
+    """Check versions, OpenGL, disk, memory and demonstrations for a run; nothing is changed."""
+    from pipeline.run.run import Run
+    from pipeline.validation import doctor
+
+    return doctor.run(Run(load_config(config)))
+
+
+@click.command(cls=Command)
+def axes() -> None:
+    """List the axes of perturbation, their components, and the parts of an episode that each generates again."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from pipeline.axes import AXES, components_of
+
+    table = Table("axis", "components", "made again", "changes", box=None)
+    for axis in AXES:
+        kind = AXES[axis].draws[0]
+        views = " and ".join(sorted(kind.views)) or "instruction"
+        table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
+    Console(highlight=False).print(table)
+    print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` shows what an axis does.")
+
+
+@click.command(cls=Command)
+@click.argument(
+    "patterns", metavar="[PATTERN]...", nargs=-1, help="Patterns as in demos.tasks, such as 'libero_goal/*'."
+)
+def tasks(patterns: tuple[str, ...]) -> None:
+    """List LIBERO's tasks and your own, by their names in demos.tasks, with their instructions."""
+    from pipeline.libero.tasks import select_tasks
+
+    for task in select_tasks(patterns or ["*"]):
+        print(f"{task}\t{task.instruction}")
+
+
+class AxisNames(OneOf):
+    """Name of an axis, names of several joined by +, or ``all``."""
+
+    def __init__(self) -> None:
+        super().__init__(_axes)
+
+    def convert(self, value: str, parameter: click.Parameter | None, context: click.Context | None) -> str:
+        from pipeline.axes import axes_of
+
+        if value == EVERY:
+            return value
+        try:
+            return "+".join(axes_of(value))
+        except ValueError as error:
+            self.fail(f"{error}; or {EVERY}.", parameter, context)
+
+
+def _axes() -> Iterable[str]:
+    from pipeline.axes import AXES
+
+    return (*AXES, EVERY)
+
+
+@click.command(cls=Command)
+@click.argument("task", metavar="TASK", help="Pattern of <suite>/<task>, such as 'libero_goal/turn_on*'.")
+@click.argument(
+    "axis",
+    metavar="AXIS",
+    type=AxisNames(),
+    help=f"An axis, several joined by +, or `{EVERY}` for one picture of each axis.",
+)
+@click.argument(
+    "config",
+    metavar="[CONFIG]",
+    required=False,
+    type=PATH,
+    help="Configuration whose seed, ranges and demonstrations are used; without it, the defaults.",
+)
+@click.option(
+    "--out", metavar="FILE", type=PATH, default=Path("sheet.png"), help="Picture to write (default: sheet.png)."
+)
+def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
+    """Render perturbations of a task into one picture.
+
+    The picture shows the first frame of the task, and up to eleven perturbations over the components and levels of an
+    axis. Several axes joined by +, such as camera+noise, change each picture together. With `all`, the picture shows a
+    strong perturbation on each axis next to the clean twin.
+
+    An axis that the configuration does not name has default ranges. If FILE ends in .jpg, it is a JPEG, else a PNG.
+    Only a picture of an earlier preview is overwritten.
+    """
+    from PIL.PngImagePlugin import PngInfo
+
+    from pipeline import gl
+    from pipeline.config import Config
+    from pipeline.files import refuse_other_file, replaced
+    from pipeline.libero.tasks import select_tasks
+    from pipeline.report import preview
+    from pipeline.testset import benchmark
+
+    settings = load_config(config) if config else Config.model_validate(DEFAULTS)
+    chosen = select_tasks([task])
+    refuse_other_file(out, PREVIEW)
+    gl.choose()  # Without a working renderer, stop before slow work.
+    stage = preview.staged(chosen, settings)
+    with replaced(out) as temporary:
+        if axis == EVERY:
+            picture = preview.overview(stage, settings, benchmark.load())
+        else:
+            picture = preview.axis_sheet(stage, axis, settings, benchmark.load())
+        if out.suffix == ".jpg":
+            picture.save(temporary, format="JPEG", quality=90, comment=PREVIEW)
+        else:
+            metadata = PngInfo()
+            metadata.add_text("Software", PREVIEW)
+            picture.save(temporary, format="PNG", pnginfo=metadata)
+        among = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
+        print(f"{out} shows {axis} on {stage.demo.demo_id}{among}")
+
+
+@click.command(cls=Command)
+@config_argument
+def sources(config: Path) -> None:
+    """Fetch and convert the textures and objects of a configuration, and count them.
+
+    An axis that is not configured counts with its default sources. The last line is JSON.
+    """
+    from pipeline.axes import AXES
+
+    axes_of_run = load_config(config).plan.axes.configured()
+    numbers: dict[str, int] = {}
+    for name, axis in AXES.items():
+        numbers.update((axes_of_run.get(name) or axis()).offered())
+    print(json.dumps(numbers))
+
+
+@click.command(cls=Command)
+@click.argument("bddl_file", metavar="BDDL_FILE", type=PATH, help="File of the task, <suite>/<task>.bddl.")
+@click.option("--out", metavar="FILE", type=PATH, required=True, help="Bank to extend or to begin, such as bank.yaml.")
+@click.option(
+    "--per-class",
+    metavar="N",
+    type=click.IntRange(min=1),
+    default=9,
+    help="Rewrites wanted of each class (default: 9).",
+)
+@click.option(
+    "--endpoint", metavar="URL", required=True, help="Address before /chat/completions: http://localhost:8000/v1."
+)
+@click.option("--model", metavar="NAME", required=True, help="Name of the model at the endpoint.")
+def rewrite(bddl_file: Path, out: Path, per_class: int, endpoint: str, model: str) -> None:
+    """Add rewrites of a task's instruction by a language model to a bank.
+
+    An OpenAI-compatible endpoint is asked for rewrites of each class (distraction, common sense, reasoning chain,
+    paraphrase) until the bank has enough of each. A rewrite must pass the same lint as the shipped bank. A stopped
+    command resumes when it is called again. A key is read from OPENAI_API_KEY.
+    """
+    from pipeline.rewriting.language_model import LanguageModel
+    from pipeline.rewriting.rewrite import extend
+
+    extend(bddl_file, out, per_class, LanguageModel(endpoint, model))
+    print(f"{out} holds {per_class} rewrites of each class for {bddl_file.stem}")

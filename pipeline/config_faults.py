@@ -1,0 +1,116 @@
+"""Sentences for the faults that pydantic finds in a configuration."""
+
+import reprlib
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+Location = tuple[int | str, ...]
+"""Keys and positions that lead to a value, from the top of the configuration."""
+
+EXPECTED = {
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "tuple_type": "a list, such as [1, 2]",
+    "list_type": "a list, such as [1, 2]",
+    "model_type": "fields with values",
+    "model_attributes_type": "fields with values",
+    "dict_type": "names with values",
+    "path_type": "a path",
+    "greater_than_equal": "at least {ge}",
+    "greater_than": "more than {gt}",
+    "less_than_equal": "at most {le}",
+    "less_than": "less than {lt}",
+    "multiple_of": "a multiple of {multiple_of}",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+    "too_short": "at least {min_length} values",
+    "too_long": "at most {max_length} values",
+    "string_too_long": "at most {max_length} characters",
+    "string_too_short": "at least {min_length} characters",
+    "finite_number": "a finite number",
+}
+"""Type of an error of pydantic to the words for what was expected."""
+
+PATTERNS = {
+    r"^[a-z][a-z0-9_]*$": "a lower-case letter, then lower-case letters, digits or underscores",
+    r"^([a-z][a-z0-9_]*)?$": "a lower-case letter, then lower-case letters, digits or underscores",
+}
+"""Regular expression of a field to its description."""
+
+
+def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
+    """Describe each fault of a configuration: field, fault, given value.
+
+    An error that only follows from another one, such as a list without its invalid values, is left out.
+
+    Args:
+        model: the model that was validated.
+    """
+    faults = error.errors()
+    locations = [fault["loc"] for fault in faults]
+    lines = []
+    for fault in faults:
+        location = fault["loc"]
+        follows = any(len(other) > len(location) and other[: len(location)] == location for other in locations)
+        if follows and fault["type"] in ("too_short", "too_long"):
+            continue
+        field = ".".join(map(str, location)) or "top level"
+        lines.append(f"{field}: {_sentence(fault, model)}")
+    return lines
+
+
+def _sentence(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
+    context, given = fault.get("ctx", {}), reprlib.repr(fault["input"])
+    match fault["type"]:
+        case "value_error":
+            return f"{context['error']} (got {given})"
+        case "missing":
+            return "this field is required"
+        case "extra_forbidden":
+            *parents, name = fault["loc"]
+            return f"there is no such field; {_suggestion(str(name), _fields_at(model, tuple(parents)))}"
+        case "string_pattern_mismatch":
+            pattern = context["pattern"]
+            return f"expected {PATTERNS.get(pattern, f'text that matches {pattern}')}, got {given}"
+        case kind if kind in EXPECTED:
+            return f"expected {EXPECTED[kind].format(**context)}, got {given}"
+    return f"{fault['msg']} (got {given})"
+
+
+def _suggestion(name: str, fields: Sequence[str]) -> str:
+    similar = get_close_matches(name, fields, n=1)
+    if similar:
+        return f"did you mean {similar[0]}?"
+    return f"the fields are {', '.join(fields)}"
+
+
+def _fields_at(model: type[BaseModel], location: Location) -> list[str]:
+    """List the fields of the models that a value at a location may have."""
+    models = [model]
+    for key in location:
+        annotations = [each.model_fields[key].annotation for each in models if key in each.model_fields]
+        # A position in a list, or the name of a member of a union, does not change the models.
+        if annotations:
+            models = []
+            for annotation in annotations:
+                models += _models_in(annotation)
+    return list(dict.fromkeys(name for each in models for name in each.model_fields))
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """List the models that a type annotation contains."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    models = []
+    for part in get_args(annotation):
+        models += _models_in(part)
+    return models

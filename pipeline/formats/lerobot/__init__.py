@@ -1,0 +1,296 @@
+"""LeRobotDataset v3.0, written directly and checked by lerobot itself, and v2.1 for clients with a lerobot of 2025."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from math import ceil
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import pyarrow as pa
+from packaging.version import Version
+from pydantic import Field, field_validator
+
+from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, GripperSpec
+from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
+from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
+from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Convention, camera_column
+from pipeline.formats.read_back import Copy, Fault
+from pipeline.grouping import grouped
+from pipeline.tables import column
+from pipeline.types import Count, Extra
+
+EPISODES_OF_A_PIECE = 50
+"""Largest number of episodes that are written again after a call was killed; the files do not depend on it."""
+
+
+class LeRobotConfig(FormatOptions):
+    """Options of the LeRobot dataset.
+
+    Attributes:
+        name: of the dataset; ``libero_`` and the name of the run when left out.
+        shards: files of each kind, at least; more where one would have more than 200 MB.
+        frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
+        validation: share of each task's demonstrations whose episodes come last, as the split ``val``.
+        language: whether frames also have their task's rewrites and what is being done, in lerobot's language column.
+            lerobot before 0.6 cannot read a set with it.
+    """
+
+    name: Name = ""
+    # The identity of finished datasets depends on their options, which contain the field under its first name.
+    shards: Count | None = Field(default=None, serialization_alias="parts")
+    frames: Literal["video", "images"] = "video"
+    validation: Share = 0.0
+    # Excluded at its default, as ``lerobot_v21``.
+    language: bool = Field(default=False, exclude_if=lambda language: not language)
+
+    @field_validator("language")
+    @classmethod
+    def _readable(cls, language: bool) -> bool:
+        if not language:
+            return language
+        installed = version("lerobot")
+        if Version(installed) < Version("0.6"):
+            raise ValueError(
+                f"lerobot {installed}, which checks the set here, cannot read language columns; expected 0.6 or later, "
+                "which the installation on Python 3.12 or later has"
+            )
+        return language
+
+
+class LeRobot(Format[LeRobotConfig]):
+    """Dataset in which files of one number hold the same episodes: of data, of each video and of ``meta/episodes``."""
+
+    name: ClassVar = "lerobot"
+    title: ClassVar = "LeRobot"
+    options_type: ClassVar = LeRobotConfig
+    by_default: ClassVar = True
+    recipe: ClassVar = 8
+    packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
+    group: ClassVar = "lerobot"
+    rewrites_instructions: ClassVar = True
+    step_s: ClassVar = 0.0015
+    columns: ClassVar = (
+        column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
+    )
+    keys = (
+        {view: spec.lerobot_key for view, spec in SCHEMA.views.items()}
+        | {name: getattr(SCHEMA, name).lerobot_key for name in MOTION}
+        | {f"{view}_{name}": camera_column(view, name) for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
+        | {"provenance": "meta/provenance.parquet"}
+    )
+    clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
+
+    @property
+    def language(self) -> bool:
+        return self.options.language
+
+    @property
+    def _convention(self) -> Convention:
+        return Convention(self.options.frames, language=self.language)
+
+    @property
+    def root(self) -> Path:
+        """Return the folder for ``LeRobotDataset(repo_id, root=root)``."""
+        return self.folder / self.options.name
+
+    def step_kb(self, sizes: StepSizes) -> float:
+        return self._convention.step_kb(sizes)
+
+    def pieces(self, episodes: Episodes) -> list[Piece]:
+        """Divide the episodes into pieces, each one file of each kind.
+
+        lerobot's splits are consecutive ranges of episodes.
+        """
+        slices: dict[str, tuple[str, Sequence[str]]] = {}
+        for split_name, members in episodes.by_split(self.options.validation).items():
+            share = round((self.options.shards or 0) * len(members) / len(episodes.known))
+            steps = sum(episodes.known[episode_id].steps for episode_id in members)
+            least = ceil(steps / self._steps_of_a_file())
+            for ids in split(members, max(1, share, least)):
+                slices[f"files/{len(slices):05d}"] = split_name, ids
+        return in_a_row(slices, episodes.known)
+
+    def sets(self, pieces: Sequence[Piece]) -> set[str]:
+        return {self.options.name}
+
+    def _steps_of_a_file(self) -> int:
+        """Return the number of steps in a file of ``FILE_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
+        views = len(SCHEMA.views)
+        maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in self.extras)
+        images_kb = 40.0 if self.options.frames == "images" else 0.0
+        data_kb = 0.5 + views * (maps_kb + images_kb)
+        return int(1000 * FILE_MB / max(data_kb, 12.0))
+
+    def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
+        from pipeline.formats.lerobot import write
+
+        write.write_piece(path, piece, load, self._convention, self.extras)
+
+    def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, int]]:
+        from pipeline.formats.lerobot import write
+
+        write.finish(work, work / "dataset" / self.options.name, pieces, self._convention, self.extras)
+        ids = [episode_id for piece in pieces for episode_id in piece.ids]
+        return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
+
+    def open(self) -> None:
+        from pipeline.formats.lerobot import read
+
+        with read.readable(self.root):
+            read.rows(self.root)
+
+    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+        from pipeline.formats.lerobot import check
+
+        return check.check(self.root, cache, kept, self._convention, self.extras, self.options.validation)
+
+    def read(self, row: Row, cache: Path) -> Copy | None:
+        from pipeline.formats.lerobot import read
+
+        return read.read(self.root, row["episode_id"], self.extras)
+
+    def repository_path(self, file: str) -> str:
+        # lerobot reads a dataset from the root of the repository.
+        return file.removeprefix(f"{self.options.name}/")
+
+    def repository_folders(self) -> set[str]:
+        return {"data", "meta", "videos"}
+
+    def tag(self) -> str:
+        """Return the tag that lerobot's loader requires."""
+        return str(json.loads((self.root / "meta" / "info.json").read_text())["codebase_version"])
+
+    def viewer(self) -> list[dict[str, str]]:
+        # lerobot's own upload contains this entry.
+        return [{"config_name": "default", "data_files": "data/*/*.parquet"}]
+
+    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+        return f"""\
+lerobot:
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("{repository}")
+```
+
+`meta/provenance.parquet` has the provenance of each `episode_index`. For training, `$DATA` is a folder with the dataset
+and its scripts:
+
+```sh
+export DATA=$PWD/{name}
+hf download {repository} --repo-type dataset --local-dir $DATA/lerobot/{name} --exclude "finetune/*"
+hf download {repository} --repo-type dataset --local-dir $DATA --include "finetune/*"
+```
+"""
+
+
+class LeRobotV21Config(FormatOptions):
+    """Options of LeRobot datasets of version 2.1.
+
+    Attributes:
+        name: of the dataset, or what the sets' names begin with; ``libero_`` and the name of the run when left out.
+        convention: ``ipec`` for GR00T, starVLA and others: a set for each suite, as IPEC-COMMUNITY's of LIBERO, with
+            videos and a gripper of 1 open, 0 closed. ``openpi``: one set, as openpi's configuration of LIBERO reads it.
+        validation: share of each task's demonstrations whose episodes go into sets of their own, named ``..._val``.
+    """
+
+    name: Name = ""
+    convention: Literal["ipec", "openpi"]
+    validation: Share = 0.0
+
+
+class LeRobotV21(Format[LeRobotV21Config]):
+    """Sets of v2.1, in which each episode has files of its own.
+
+    Validation episodes form sets of their own, because no client reads splits.
+    """
+
+    name: ClassVar = "lerobot_v21"
+    title: ClassVar = "LeRobot v2.1"
+    options_type: ClassVar = LeRobotV21Config
+    recipe: ClassVar = 3
+    packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
+    group: ClassVar = LeRobot.group
+    step_s: ClassVar = LeRobot.step_s
+    # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
+    columns: ClassVar[tuple[pa.Field, ...]] = ()
+
+    def __init__(self, data: Path, options: LeRobotV21Config, extras: Sequence[Extra] = ()) -> None:
+        super().__init__(data, options, extras)
+        self.convention = CONVENTIONS[options.convention]
+        self.keys = {name: self.convention.name(key) for name, key in LeRobot.keys.items()}
+        if self.convention.open_is_one:
+            self.gripper = GripperSpec(open=1.0, close=0.0)
+        self.clients = {"ipec": ("starvla", "gr00t"), "openpi": ("openpi", "openpi_serve")}[options.convention]
+
+    def step_kb(self, sizes: StepSizes) -> float:
+        return self.convention.step_kb(sizes)
+
+    def pieces(self, episodes: Episodes) -> list[Piece]:
+        pieces = []
+        for split_name, members in episodes.by_split(self.options.validation).items():
+            sets = {self.options.name: members}
+            if self.options.convention == "ipec":
+                suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
+                sets = by_suite(suites, self.options.name)
+            for name, ids in sets.items():
+                folder = f"files/{name}" if split_name == "train" else f"files/{name}_{split_name}"
+                parts = split(ids, -(-len(ids) // EPISODES_OF_A_PIECE))
+                slices = {f"{folder}/{number:05d}": (split_name, part) for number, part in enumerate(parts)}
+                pieces += in_a_row(slices, episodes.known)
+        return pieces
+
+    def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
+        from pipeline.formats.lerobot import write
+
+        write.write_piece_v21(path, piece, load, self.convention, self.extras)
+
+    def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
+        from pipeline.formats.lerobot import write
+
+        for name, members in grouped((Path(piece.path).parent.name, piece) for piece in pieces).items():
+            write.finish_v21(work, work / "dataset" / name, members, self.convention, self.extras)
+        return {}
+
+    def open(self) -> None:
+        from pipeline.formats.lerobot import read
+
+        read.open_all_v21(self.folder)
+
+    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+        from pipeline.formats.lerobot import check
+
+        return check.check_v21(self.folder, kept, self.convention, self.extras, self.options.validation)
+
+    def read(self, row: Row, cache: Path) -> Copy | None:
+        from pipeline.formats.lerobot import read
+
+        return read.read_v21(self.folder, row["episode_id"], self.convention, self.extras)
+
+    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+        actions = self.keys["action"]
+        return f"""\
+The repository is laid out as the folder that `finetune/` expects, here `$DATA`; below `lerobot_v21/` lies a dataset in
+the convention `{self.options.convention}` for each folder, with the actions as `{actions}`:
+
+```sh
+export DATA=$PWD/{name}
+hf download {repository} --repo-type dataset --local-dir $DATA
+```
+
+lerobot up to 0.3.3, which reads version 2.1:
+
+```python
+import os
+from pathlib import Path
+
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+for root in sorted(Path(os.environ["DATA"], "lerobot_v21").iterdir()):
+    dataset = LeRobotDataset(root.name, root=root)
+```
+
+`meta/provenance.parquet` of each has the provenance of each `episode_index`.
+"""
