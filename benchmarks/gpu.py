@@ -1,15 +1,16 @@
 """Measures of a GPU's rendering: frames per second of 1 to 16 processes by each drawing, and their pixels.
 
     python benchmarks/gpu.py --pack FOLDER
-    python benchmarks/gpu.py FOLDER [--seconds 3] [--processes 1 4 8 16] [--drawings plain culled ...] [--states 12]
+    python benchmarks/gpu.py FOLDER [--seconds 3] [--processes 1 4 8 16] [--drawings plain layers ...] [--states 12]
 
 The first call replays one demonstration of each task of ``TASKS``, and packs the scenes with their meshes and images.
 The second call needs MuJoCo, NumPy, OpenCV, Numba, Pydantic and PyOpenGL, but no LIBERO. It compares the frames of each
 drawing with plain frames of the same device, in all scenes, with and without shadows. Then some processes render the
-states of the first scene with both cameras, JPEG included, each process in its own context. A last round measures the
-time that parts of the work take. It takes about four minutes on a GPU.
+states of the first scene with both cameras, JPEG included, each process in its own context, with the environment of a
+run's workers. Each time that parts of the work take is measured separately. It takes about two minutes on a GPU.
 
-The last line is JSON with the device, and for each drawing:
+The last line is JSON with the device, the drawings that a run with 1 worker and with the largest number would use, and
+for each drawing:
 
 - the number of compared frames, of frames with other pixels, and the largest difference in grey levels;
 - for each number of processes: frames per second, CPU time of a frame, peak memory, the GPU's load by ``nvidia-smi``;
@@ -28,9 +29,10 @@ import shutil
 import subprocess
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,13 +42,16 @@ import mujoco
 import numpy as np
 
 from pipeline import gl
+from pipeline.compute.workers import VARIABLES
 from pipeline.config import RenderConfig
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.in_flight import InFlightDrawing
 from pipeline.rendering.opengl import calls
+from pipeline.rendering.savings import drawing_of, why_plain
 from pipeline.rendering.software.drawing import SoftwareDrawing
-from pipeline.rendering.software.gpu import GpuDrawing
+from pipeline.rendering.software.layers import LayersDrawing
 from pipeline.types import Frame, State
 
 CAMERAS = ("agentview", "robot0_eye_in_hand")
@@ -57,35 +62,16 @@ TASKS = {
 }
 """Packed scenes; frames per second are of the first scene, as in former measurements."""
 
+Frames = np.ndarray[Any, np.dtype[np.uint8]]
+
 _FILE = re.compile(r'\sfile\w*="')
 """Begin of an attribute that names a file."""
 
-YIELDS = {"__GL_YIELD": "USLEEP"}
-"""Environment of a further pool: NVIDIA's driver sleeps where it would wait in a loop."""
-
-
-class PlainInFlight(GpuDrawing):
-    """Plain drawing with frames in flight, and without culling."""
-
-    def _draw(self, data: mujoco.MjData, camera: str) -> None:
-        PlainDrawing._draw(self, data, camera)
-
-
-@dataclass(frozen=True)
-class Way:
-    """A kind of drawing, and the number of frames that it has in flight while the process works on; 0 waits."""
-
-    kind: type[PlainDrawing]
-    in_flight: int = 0
-
-
-WAYS = {
-    "plain": Way(PlainDrawing),
-    "plain, 2 in flight": Way(PlainInFlight, 2),
-    "culled": Way(GpuDrawing),
-    "culled, 2 in flight": Way(GpuDrawing, 2),
-    "culled, 6 in flight": Way(GpuDrawing, 6),
-    "savings": Way(SoftwareDrawing),
+KINDS: dict[str, type[PlainDrawing]] = {
+    "plain": PlainDrawing,
+    "plain, 2 in flight": InFlightDrawing,
+    "layers": LayersDrawing,
+    "savings": SoftwareDrawing,
 }
 
 
@@ -143,7 +129,7 @@ def main() -> None:
     parser.add_argument("--pack", action="store_true", help="write the folder")
     parser.add_argument("--seconds", type=float, default=3)
     parser.add_argument("--processes", type=int, nargs="+", default=[1, 4, 8, 16])
-    parser.add_argument("--drawings", nargs="+", default=list(WAYS), choices=list(WAYS), metavar="NAME")
+    parser.add_argument("--drawings", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="NAME")
     parser.add_argument("--states", type=int, default=12, help="of each scene, in which pixels are compared")
     arguments = parser.parse_args()
     if arguments.pack:
@@ -153,11 +139,16 @@ def main() -> None:
     print(choice, flush=True)
     names, most = arguments.drawings, max(arguments.processes)
     figures: dict[str, dict[str, Any]] = {name: {} for name in names}
+    chosen: dict[int, Any] = {}
+    with pool(1, arguments.folder) as workers:
+        chosen[1] = asked(workers, [("choose",)])[0]
     with pool(min(most, len(names)), arguments.folder) as workers:
         for name, pixels in zip(names, compared(workers, names, arguments.states), strict=True):
             figures[name]["pixels"] = pixels
             print(name, pixels, flush=True)
     with pool(most, arguments.folder) as workers:
+        chosen[most] = asked(workers[:1], [("choose",)])[0]
+        print(chosen, flush=True)
         for name in names:
             fault = opened(workers, name)
             if fault:
@@ -165,20 +156,14 @@ def main() -> None:
                 print(name, fault, flush=True)
                 continue
             for count in arguments.processes:
-                measured = rendered(workers[:count], name, arguments.seconds)
+                measured = rendered(workers[:count], arguments.seconds)
                 figures[name][f"{count} processes"] = measured
                 print(name, count, measured, flush=True)
             for count in (1, most):
-                parts = profiled(workers[:count], name, arguments.seconds / 2)
+                parts = profiled(workers[:count], arguments.seconds / 2)
                 figures[name][f"ms a frame of {count}"] = parts
                 print(name, count, parts, flush=True)
-    with pool(most, arguments.folder, YIELDS) as workers:
-        for name in names:
-            if opened(workers, name) is None:
-                measured = rendered(workers, name, arguments.seconds)
-                figures[name][f"{most} processes, {YIELDS}"] = measured
-                print(name, most, YIELDS, measured, flush=True)
-    print(json.dumps({"device": choice.device, "cores": os.cpu_count(), "drawings": figures}))
+    print(json.dumps({"device": choice.device, "cores": os.cpu_count(), "chosen": chosen, "drawings": figures}))
 
 
 def pack(folder: Path) -> None:
@@ -203,12 +188,11 @@ def pack(folder: Path) -> None:
 
 
 @contextmanager
-def pool(count: int, folder: Path, variables: Mapping[str, str] | None = None) -> Iterator[list[Connection]]:
-    """Start processes with some environment variables, and yield a connection to each when all have the first scene."""
-    context, setup = multiprocessing.get_context("spawn"), gl.WorkerSetup()
+def pool(count: int, folder: Path) -> Iterator[list[Connection]]:
+    """Start processes like a run's workers, and yield a connection to each when all have the first scene."""
+    context, setup = multiprocessing.get_context("spawn"), gl.WorkerSetup(count)
     connections, processes = [], []
-    former = os.environ.copy()
-    os.environ.update(variables or {})
+    os.environ.update(VARIABLES)
     for number in range(count):
         connection, of_worker = context.Pipe()
         process = context.Process(target=serve, args=(of_worker, setup, number, folder), daemon=True)
@@ -217,8 +201,6 @@ def pool(count: int, folder: Path, variables: Mapping[str, str] | None = None) -
         of_worker.close()
         connections.append(connection)
         processes.append(process)
-    os.environ.clear()
-    os.environ.update(former)
     try:
         for connection in connections:
             connection.recv()
@@ -265,10 +247,10 @@ def opened(workers: Sequence[Connection], name: str) -> str | None:
     return fault_of(asked(workers, [("open", name)] * len(workers)))
 
 
-def rendered(workers: Sequence[Connection], name: str, seconds: float) -> dict[str, Any]:
+def rendered(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
     """Measure the open drawings of some workers at a time."""
     with gpu_load() as loads:
-        done = asked(workers, [("render", name, seconds)] * len(workers))
+        done = asked(workers, [("render", seconds)] * len(workers))
     fault = fault_of(done)
     if fault:
         return {"fault": fault}
@@ -281,9 +263,9 @@ def rendered(workers: Sequence[Connection], name: str, seconds: float) -> dict[s
     }
 
 
-def profiled(workers: Sequence[Connection], name: str, seconds: float) -> dict[str, Any]:
+def profiled(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
     """Return the milliseconds of a frame by part of the work, the mean of some workers with open drawings."""
-    done = asked(workers, [("profile", name, seconds)] * len(workers))
+    done = asked(workers, [("profile", seconds)] * len(workers))
     fault = fault_of(done)
     if fault:
         return {"fault": fault}
@@ -316,20 +298,24 @@ def serve(connection: Connection, setup: gl.WorkerSetup, number: int, folder: Pa
     connection.send(None)
     drawing: PlainDrawing | None = None
     for question in iter(connection.recv, None):
-        if drawing and question[0] in ("open", "compare"):
+        subject, *arguments = question
+        if drawing and subject not in ("render", "profile"):
             drawing.close()
             drawing = None
         answer: Any = None
         try:
-            if question[0] == "open":
-                drawing = WAYS[question[1]].kind(scene.model)
-                render(scene, drawing, WAYS[question[1]].in_flight, 0.3)
-            elif question[0] == "compare":
-                answer = asdict(compare(folder, question[1], question[2]))
-            elif drawing and question[0] == "render":
-                answer = render(scene, drawing, WAYS[question[1]].in_flight, question[2])
+            if subject == "choose":
+                drawing = drawing_of(scene.model)
+                answer = {"drawing": type(drawing).__name__, "why plain": why_plain()}
+            elif subject == "open":
+                drawing = KINDS[arguments[0]](scene.model)
+                render(scene, drawing, 0.3)
+            elif subject == "compare":
+                answer = asdict(compare(folder, *arguments))
+            elif drawing and subject == "render":
+                answer = render(scene, drawing, *arguments)
             elif drawing:
-                answer = profile(scene, drawing, WAYS[question[1]].in_flight, question[2])
+                answer = profile(scene, drawing, *arguments)
         except Exception as error:  # drivers fail in many ways, and each is an answer here
             answer = f"{type(error).__name__}: {error}"
         connection.send(answer)
@@ -337,10 +323,11 @@ def serve(connection: Connection, setup: gl.WorkerSetup, number: int, folder: Pa
         drawing.close()
 
 
-def render(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float) -> Work:
+def render(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
     """Render and encode the scene's states in turn for some seconds, with both cameras."""
     work, data = Work(parts_s=dict.fromkeys(("restore", "start", "wait", "encode"), 0.0)), mujoco.MjData(scene.model)
     waiting: deque[Callable[[], Frame]] = deque()
+    jpeg_quality = RenderConfig().jpeg_quality
 
     def timed(part: str, function: Callable[..., Any], *arguments: Any) -> Any:
         began = time.perf_counter()
@@ -350,7 +337,7 @@ def render(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float) 
 
     def finish() -> None:
         frame = timed("wait", waiting.popleft())
-        timed("encode", lambda: encode(to_policy(frame), RenderConfig()))
+        timed("encode", lambda: encode(to_policy(frame), jpeg_quality))
         work.frames += 1
 
     start, start_cpu, step = time.perf_counter(), time.process_time(), 0
@@ -358,8 +345,8 @@ def render(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float) 
         timed("restore", scene.restore, data, step)
         step = (step + 1) % (len(scene.states) - 1)
         for camera in CAMERAS:
-            waiting.append(timed("start", start_frame, drawing, data, camera, in_flight))
-            while len(waiting) > in_flight:
+            waiting.append(timed("start", drawing.start_frame, data, camera))
+            while len(waiting) > drawing.steps_ahead * len(CAMERAS):
                 finish()
     while waiting:
         finish()
@@ -368,15 +355,7 @@ def render(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float) 
     return work
 
 
-def start_frame(drawing: PlainDrawing, data: mujoco.MjData, camera: str, in_flight: int) -> Callable[[], Frame]:
-    """Start to render a frame; without frames in flight, wait for it too."""
-    if in_flight:
-        return drawing.start_frame(data, camera)
-    frame = drawing.frame(data, camera)
-    return lambda: frame
-
-
-def profile(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float) -> Work:
+def profile(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
     """Render like ``render``, and measure the calls of MuJoCo and the GPU's time for its pictures too."""
     spent_s: dict[str, float] = {}
     queries: list[int] = []
@@ -403,7 +382,7 @@ def profile(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float)
     for name, call in (calls_of_mujoco | {"mjr_render": on_gpu}).items():
         setattr(mujoco, name, call)
     try:
-        work = render(scene, drawing, in_flight, seconds)
+        work = render(scene, drawing, seconds)
     finally:
         for name, function in functions.items():
             setattr(mujoco, name, function)
@@ -417,28 +396,35 @@ def profile(scene: Scene, drawing: PlainDrawing, in_flight: int, seconds: float)
 def compare(folder: Path, name: str, states: int) -> Pixels:
     """Compare the frames of a drawing with plain frames, in all scenes, with and without shadows."""
     frames = other = most_levels = 0
-    for task in TASKS:
-        scene = Scene.load(folder, task)
-        for shadows in (False, True):
-            scene.model.light_castshadow[:] |= shadows
-            plain = frames_of(scene, PlainDrawing(scene.model), 0, states)
-            ours = frames_of(scene, WAYS[name].kind(scene.model), WAYS[name].in_flight, states)
-            levels = np.abs(ours.astype(int) - plain).reshape(len(plain), -1).max(axis=1)
-            frames, other = frames + len(levels), other + int(np.count_nonzero(levels))
-            most_levels = max(most_levels, int(levels.max()))
+    plain_frames = list(frames_of_scenes(folder, PlainDrawing, states))
+    for plain, ours in zip(plain_frames, frames_of_scenes(folder, KINDS[name], states), strict=True):
+        levels = np.abs(ours.astype(int) - plain).reshape(len(plain), -1).max(axis=1)
+        frames, other = frames + len(levels), other + int(np.count_nonzero(levels))
+        most_levels = max(most_levels, int(levels.max()))
     return Pixels(frames, other, most_levels)
 
 
-def frames_of(scene: Scene, drawing: PlainDrawing, in_flight: int, states: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Render some states, from the first to the last, with both cameras, (N, H, W, 3), and close the drawing."""
+def frames_of_scenes(folder: Path, kind: type[PlainDrawing], states: int) -> Iterator[Frames]:
+    """Yield the frames of each scene, without and with shadows; a drawing adopts the following scenes if it can."""
+    with ExitStack() as opened:
+        drawing: PlainDrawing | None = None
+        for task, shadows in product(TASKS, (False, True)):
+            scene = Scene.load(folder, task)
+            scene.model.light_castshadow[:] |= shadows
+            if drawing is None or not drawing.adopt(scene.model):
+                opened.close()
+                drawing = opened.enter_context(closing(kind(scene.model)))
+            yield frames_of(scene, drawing, states)
+
+
+def frames_of(scene: Scene, drawing: PlainDrawing, states: int) -> Frames:
+    """Render some states, from the first to the last, with both cameras, (N, H, W, 3)."""
     data = mujoco.MjData(scene.model)
     waiting: list[Callable[[], Frame]] = []
-    with closing(drawing):
-        for step in np.linspace(0, len(scene.states) - 1, states).round().astype(int).tolist():
-            scene.restore(data, step)
-            for camera in CAMERAS:
-                waiting.append(start_frame(drawing, data, camera, in_flight))
-        return np.stack([wait() for wait in waiting])
+    for step in np.linspace(0, len(scene.states) - 1, states).round().astype(int).tolist():
+        scene.restore(data, step)
+        waiting += [drawing.start_frame(data, camera) for camera in CAMERAS]
+    return np.stack([wait() for wait in waiting])
 
 
 if __name__ == "__main__":

@@ -46,9 +46,20 @@ class PlainDrawing:
 
     Close it before you create another drawing.
 
+    Attributes:
+        steps_ahead: number of steps, of up to two views each, to start by ``start_frame`` before the frames of an
+            earlier step are taken; 0 if the device does not work meanwhile.
+
     Raises:
         PipelineError: if this machine cannot render.
     """
+
+    steps_ahead = 0
+
+    @staticmethod
+    def possible(model: mujoco.MjModel) -> bool:
+        """Return whether this drawing can render a model; the plain drawing can render every model."""
+        return True
 
     def __init__(self, model: mujoco.MjModel):
         gl.prepare()

@@ -22,9 +22,6 @@ from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Floats, Frame, Jpeg, Rendered, Task, Trajectory
 
-STEPS_AHEAD = 3
-"""Steps whose frames a GPU renders while the frames of an earlier step are encoded; a step has up to two views."""
-
 Started = Mapping[str, Callable[[], Frame]]
 """View to a function that waits for its clean frame."""
 
@@ -96,13 +93,13 @@ def frames_of(
 def frames_of_steps(renderer: Renderer, trajectory: Trajectory, streams: Sequence[Stream]) -> Iterator[list[Frame]]:
     """Yield the frames of ``frames_of`` before each executed action of a trajectory.
 
-    While a GPU renders the frames of ``STEPS_AHEAD`` further steps, the caller encodes the yielded frames.
+    On a GPU, further steps are rendered while the caller encodes the yielded frames (``steps_ahead``).
     """
     waiting: deque[tuple[int, Started]] = deque()
     with renderer.perturbed(streams[0].changes):
         for step in range(len(trajectory.actions)):
             waiting.append((step, _start(renderer, trajectory.states[step], trajectory.site_alpha[step], streams)))
-            if len(waiting) > STEPS_AHEAD:
+            if len(waiting) > renderer.drawing.steps_ahead:
                 first_step, started = waiting.popleft()
                 yield _finished(started, streams, first_step)
         for last_step, started in waiting:

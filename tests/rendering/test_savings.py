@@ -17,9 +17,10 @@ from conftest import REPOSITORY
 from pipeline import gl
 from pipeline.rendering import savings
 from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.in_flight import InFlightDrawing
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.drawing import SoftwareDrawing
-from pipeline.rendering.software.gpu import GpuDrawing
+from pipeline.rendering.software.layers import LayersDrawing
 from pipeline.rendering.software.skins import SkinnedMeshes
 
 SCENE = '<mujoco><worldbody><light/><camera name="eye" pos="0 0 3"/><geom size="1" group="1"/></worldbody></mujoco>'
@@ -60,10 +61,13 @@ def test_another_version_or_device_draws_plainly_and_says_so(
     assert other in record.getMessage()
 
 
-def test_a_gpu_uses_its_own_drawing(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    on_gpu = replace(gl.choose(), device="NVIDIA H200")
+@pytest.mark.parametrize(("sharing", "kind"), [(1, InFlightDrawing), (2, InFlightDrawing), (3, LayersDrawing)])
+def test_a_gpu_renders_layers_if_enough_processes_share_it(
+    sharing: int, kind: type, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    on_gpu = replace(gl.choose(), device="NVIDIA H200", sharing=sharing)
     monkeypatch.setattr(gl, "choose", lambda: on_gpu)
-    assert drawn_by() is GpuDrawing
+    assert drawn_by() is kind
     assert caplog.records == []
 
 

@@ -87,9 +87,14 @@ class Still:
 class SoftwareDrawing(PlainDrawing):
     """Drawing of models that are ``possible``, with all savings.
 
+    Attributes:
+        chooses_faces: True renders large meshes by the faces that cover a sample; False renders all meshes whole.
+
     Raises:
         PipelineError: if OpenGL reports an error.
     """
+
+    chooses_faces = True
 
     def __init__(self, model: mujoco.MjModel):
         # Create the context for the common parts of all scenes, and then switch it to this model.
@@ -132,7 +137,8 @@ class SoftwareDrawing(PlainDrawing):
         shown = self._culling.shown
         rendered = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
         self._meshes = Meshes(self._context, model, rendered, self._meshes)
-        self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, shown, self._skinned)
+        by_faces = shown & self.chooses_faces
+        self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, by_faces, self._skinned)
         self._forget_underlays()
 
     def load(self, textures: Collection[int]) -> None:

@@ -1,12 +1,10 @@
-"""Rendering of the pixels of ``PlainDrawing`` on a GPU, with less work for the GPU and less waiting for it.
+"""Plain rendering with frames in flight: a GPU renders frames while the process encodes earlier frames.
 
-* Geoms outside of the view are not rendered (``culling.py``), and mirror images only if they show.
-* The GPU copies finished frames into pixel buffers, which a process reads later. Meanwhile it prepares further frames.
-
-The other savings choose single faces or geoms for each picture. This takes more CPU time than a GPU saves.
+The GPU copies each finished frame into a pixel buffer, which the process reads later.
 """
 
 from collections.abc import Callable
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -14,14 +12,10 @@ import numpy as np
 from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import calls, check
-from pipeline.rendering.software.culling import Culling
 from pipeline.types import Frame
 
-IN_FLIGHT = 8
+BUFFERS = 8
 """Number of frames that a GPU may work on while the process does something else: four steps of two views."""
-
-CULLED = mujoco.mjNGROUP - 1
-"""A group of geoms and sites that LIBERO does not use and that is never rendered."""
 
 
 class PixelBuffers:
@@ -90,51 +84,28 @@ class PixelBuffers:
         return np.ascontiguousarray(pixels[..., :3])
 
 
-class GpuDrawing(PlainDrawing):
-    """Drawing of any model on a GPU, by public functions of MuJoCo and OpenGL.
+class InFlightDrawing(PlainDrawing):
+    """Plain drawing whose frames are in flight between ``start_frame`` and the wait for them.
 
     Raises:
         PipelineError: if this machine cannot render, or OpenGL reports an error.
     """
 
-    def __init__(self, model: mujoco.MjModel):
-        super().__init__(model)
-        self._culling = Culling(model, np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist())
-        self._buffers: PixelBuffers | None = None
+    steps_ahead = 1
 
-    @staticmethod
-    def possible(model: mujoco.MjModel) -> bool:
-        """Return whether this drawing can render a model: all its planes need bounds, which LIBERO's planes have."""
-        return bool((model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] > 0).all())
+    @cached_property
+    def _buffers(self) -> PixelBuffers:
+        """Create the buffers in the current context."""
+        return PixelBuffers(self._context, BUFFERS)
 
     def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
-        """Start to render a frame; see ``PlainDrawing``. Up to ``IN_FLIGHT`` frames are rendered at a time."""
+        """Start to render a frame; see ``PlainDrawing``. Up to ``BUFFERS`` frames are in flight at a time."""
         self._gl.make_current()
-        if self._buffers is None:
-            self._buffers = PixelBuffers(self._context, IN_FLIGHT)
         self._draw(data, camera)
-        buffers, number = self._buffers, self._buffers.start_copy()
+        number = self._buffers.start_copy()
 
         def wait() -> Frame:
             self._gl.make_current()
-            return buffers.take(number)
+            return self._buffers.take(number)
 
         return wait
-
-    def _draw(self, data: mujoco.MjData, camera: str) -> None:
-        """Render a picture without the geoms and sites that it cannot show."""
-        model, flags, picture = self._model, self._scene.flags, self._culling.picture(data, camera)
-        rendered = picture.opaque | picture.clear | picture.mirror
-        mirrors = bool(picture.mirror.any())
-        if mirrors:
-            rendered = rendered | picture.images
-        groups, site_groups = model.geom_group.copy(), model.site_group.copy()
-        try:
-            model.geom_group[:] = np.where(rendered, groups, CULLED)
-            model.site_group[:] = np.where(picture.sites, site_groups, CULLED)
-            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = mirrors
-            super()._draw(data, camera)
-        finally:
-            model.geom_group[:] = groups
-            model.site_group[:] = site_groups
-            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 1
