@@ -4,10 +4,10 @@
     python benchmarks/gpu.py FOLDER [--seconds 3] [--processes 1 4 8 16] [--drawings plain layers ...] [--states 12]
 
 The first call replays one demonstration of each task of ``TASKS``, and packs the scenes with their meshes and images.
-The second call needs MuJoCo, NumPy, OpenCV, Numba, Pydantic and PyOpenGL, but no LIBERO. It compares the frames of each
-drawing with plain frames of the same device, in all scenes, with and without shadows. Then some processes render the
-states of the first scene with both cameras, JPEG included, each process in its own context, with the environment of a
-run's workers. Each time that parts of the work take is measured separately. It takes about two minutes on a GPU.
+The second call needs no LIBERO and no robosuite. It compares the frames of each drawing with plain frames of the same
+device, in all scenes, with and without shadows. Then some processes render the states of the first scene with both
+cameras, JPEG included, each process in its own context, with the environment of a run's workers. A last round for each
+drawing measures the time that parts of the work take.
 
 The last line is JSON with the device, the drawings that a run with 1 worker and with the largest number would use, and
 for each drawing:
