@@ -17,11 +17,11 @@ test:
 doctor: setup
 	.venv/bin/python -m pipeline doctor configs/starter.yaml
 
-# pynput and evdev are left out: only lerobot's keyboard teleoperation needs them, and evdev takes a compiler.
 # The documentation in site/index.html, with search.
 site: setup
 	.venv/bin/python -m mkdocs build --strict
 
+# pynput and evdev are left out: only lerobot's keyboard teleoperation needs them, and evdev takes a compiler.
 lock: setup
 	UV_CUSTOM_COMPILE_COMMAND="make lock" .venv/bin/uv pip compile --quiet --universal --python-version 3.11 \
 		pyproject.toml --group dev --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \

@@ -3,8 +3,9 @@
     python benchmarks/render_workers.py [--config configs/starter.yaml] [--tasks 'libero_goal/put_the_bowl_*' ...]
 
 The script takes one demonstration of the starter set for each task, and the configuration's number of episodes for each
-demonstration. They are replayed once. Then the frames are rendered three times: in this process, where the time within
-``Renderer.frame`` is counted, with one worker process, and with several. Each renders with one thread.
+demonstration. They are replayed once. Then the frames are rendered three times: in this process, with one worker
+process, and with several. In this process, the time within ``Renderer.start_frame`` is counted, which renders a frame
+at once in software. Each process renders with one thread.
 
 Run the script on an otherwise idle machine, with tasks of similar scenes. The streams of a demonstration are one job;
 if two jobs differ, one worker waits for the other.
@@ -18,6 +19,7 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
@@ -57,15 +59,15 @@ def main() -> None:
             return time.perf_counter() - start
 
         drawn_s: list[tuple[float, float]] = []
-        draw = Renderer.frame
+        start_frame = Renderer.start_frame
 
-        def timed(renderer: Renderer, camera: str) -> Frame:
+        def timed(renderer: Renderer, camera: str) -> Callable[[], Frame]:
             start_s, start_cpu_s = time.perf_counter(), time.process_time()
-            frame = draw(renderer, camera)
+            wait = start_frame(renderer, camera)
             drawn_s.append((time.perf_counter() - start_s, time.process_time() - start_cpu_s))
-            return frame
+            return wait
 
-        with patch.object(Renderer, "frame", timed):
+        with patch.object(Renderer, "start_frame", timed):
             here_s = rendered(loop, "here")
         by_workers = {}
         for workers in (1, arguments.workers):

@@ -12,9 +12,10 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import chain, count
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,14 @@ class GlChoice:
         device: the renderer and its driver, as OpenGL names them.
         reason: reason of the choice.
         device_named: True if ``MUJOCO_EGL_DEVICE_ID`` named the device, so that no other device may be used.
+        sharing: number of processes that render on the device at a time, or more; 1 if it is not known.
     """
 
     backend: str
     device: str
     reason: str
     device_named: bool = False
+    sharing: int = 1
 
     @property
     def software(self) -> bool:
@@ -146,10 +149,15 @@ def gpus() -> tuple[str, ...]:
 
 
 class WorkerSetup:
-    """Choice of this process for worker processes of this machine, which skip the trials. Raises as ``choose``."""
+    """Choice of this process for worker processes of this machine, which skip the trials. Raises as ``choose``.
 
-    def __init__(self) -> None:
-        self._choice, self._gpus = choose(), gpus()
+    Args:
+        workers: number of workers, which share the GPUs evenly.
+    """
+
+    def __init__(self, workers: int):
+        self._gpus = gpus()
+        self._choice = replace(choose(), sharing=ceil(workers / max(1, len(self._gpus))))
         self._environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
 
     def __call__(self, worker: int) -> None:

@@ -17,12 +17,15 @@ VARIABLES = {
     "OPENBLAS_NUM_THREADS": "1",
     "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    "__GL_YIELD": "USLEEP",
 }
 """Environment variables of a worker process, which it inherits; Dask's own values give way to them.
 
 A worker has one thread, as GL contexts and the simulator are not shared, but OpenCV and NumPy would start a thread for
 every core. Dask makes glibc return every 64 KB that are free to the system. In software rendering, each frame may then
-request thousands of pages again, up to a tenth of a worker's time.
+request thousands of pages again, up to a tenth of a worker's time. While workers wait for a GPU that they share,
+NVIDIA's OpenGL driver for Linux keeps their cores busy, unless ``__GL_YIELD`` makes it sleep
+(``benchmarks/LOG.md``).
 """
 
 STARTS = 2
@@ -50,7 +53,7 @@ def local_cluster(workers: int | None, renders: bool) -> Iterator[tuple[Any, Cal
     with _ended(_started(workers)) as cluster, Client(cluster) as client:
         client.run(_leave_interrupts_to_the_run)
         if renders:
-            _have_rendered_alike(client)
+            _have_rendered_alike(client, workers)
         # Dask does not replace a worker that dies while it starts.
         yield client, partial(cluster.scale, workers)
 
@@ -104,11 +107,11 @@ def _ended(cluster: Any) -> Iterator[Any]:
             cluster.close()
 
 
-def _have_rendered_alike(client: Any) -> None:
-    """Make each worker of this machine, later ones included, render with the device of this process."""
+def _have_rendered_alike(client: Any, workers: int) -> None:
+    """Make each of the workers of this machine, later ones included, render with the device of this process."""
     from distributed import Worker, WorkerPlugin
 
-    prepare = gl.WorkerSetup()
+    prepare = gl.WorkerSetup(workers)
 
     class Prepared(WorkerPlugin):  # type: ignore[misc]
         def setup(self, worker: Worker) -> None:

@@ -3,7 +3,7 @@
 Any other drawing (``savings.py``) must render equal pixels.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from typing import NamedTuple
 
@@ -46,9 +46,20 @@ class PlainDrawing:
 
     Close it before you create another drawing.
 
+    Attributes:
+        steps_ahead: number of steps, of up to two views each, to start by ``start_frame`` before the frames of an
+            earlier step are taken; 0 if the device does not work meanwhile.
+
     Raises:
         PipelineError: if this machine cannot render.
     """
+
+    steps_ahead = 0
+
+    @staticmethod
+    def possible(model: mujoco.MjModel) -> bool:
+        """Return whether this drawing can render a model; the plain drawing can render every model."""
+        return True
 
     def __init__(self, model: mujoco.MjModel):
         gl.prepare()
@@ -83,9 +94,16 @@ class PlainDrawing:
         Call ``mj_forward`` on the data before.
         """
         self._gl.make_current()
-        self._update(data, camera)
-        self._render()
+        self._draw(data, camera)
         return self._pixels()
+
+    def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
+        """Start to render a frame, and return a function that waits for the frame and returns it.
+
+        The state may change meanwhile. Here the frame is rendered at once; other drawings let the device work on.
+        """
+        frame = self.frame(data, camera)
+        return lambda: frame
 
     def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
         """Render the depth, and the geom or site, of each pixel of a frame."""
@@ -128,6 +146,11 @@ class PlainDrawing:
     def close(self) -> None:
         self._gl.free()
         self._context.free()
+
+    def _draw(self, data: mujoco.MjData, camera: str) -> None:
+        """Render a picture into the off-screen buffer of the current context."""
+        self._update(data, camera)
+        self._render()
 
     def _update(self, data: mujoco.MjData, camera: str) -> None:
         self._camera.fixedcamid = self._model.camera(camera).id

@@ -4,7 +4,8 @@ Each frame comes from a stored state, so one replay is rendered under many pertu
 perturb, restore, render, add noise, turn.
 """
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Floats, Frame, Jpeg, Rendered, Task, Trajectory
+
+Started = Mapping[str, Callable[[], Frame]]
+"""View to a function that waits for its clean frame."""
 
 
 def render(
@@ -49,8 +53,7 @@ def render(
             if fault:
                 rejected |= {stream.stream_id: fault for stream in scene}
                 continue
-            for step in steps:
-                frames = frames_of(renderer, trajectory.states[step], trajectory.site_alpha[step], scene, step)
+            for frames in frames_of_steps(renderer, trajectory, scene):
                 for stream, frame in zip(scene, frames, strict=True):
                     encoded[stream.stream_id].append(encode(frame, render_config.jpeg_quality))
     views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in rejected)
@@ -83,9 +86,36 @@ def frames_of(
         step: the episode's step; random noise depends on it.
     """
     with renderer.perturbed(streams[0].changes):
-        renderer.restore(state, site_alpha)
-        views = dict.fromkeys(stream.view for stream in streams)
-        clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in views}
+        started = _start(renderer, state, site_alpha, streams)
+    return _finished(started, streams, step)
+
+
+def frames_of_steps(renderer: Renderer, trajectory: Trajectory, streams: Sequence[Stream]) -> Iterator[list[Frame]]:
+    """Yield the frames of ``frames_of`` before each executed action of a trajectory.
+
+    On a GPU, further steps are rendered while the caller encodes the yielded frames (``steps_ahead``).
+    """
+    waiting: deque[tuple[int, Started]] = deque()
+    with renderer.perturbed(streams[0].changes):
+        for step in range(len(trajectory.actions)):
+            waiting.append((step, _start(renderer, trajectory.states[step], trajectory.site_alpha[step], streams)))
+            if len(waiting) > renderer.drawing.steps_ahead:
+                first_step, started = waiting.popleft()
+                yield _finished(started, streams, first_step)
+        for last_step, started in waiting:
+            yield _finished(started, streams, last_step)
+
+
+def _start(renderer: Renderer, state: Floats, site_alpha: NDArray[np.float32], streams: Sequence[Stream]) -> Started:
+    """Start to render the clean frame of each view of a state."""
+    renderer.restore(state, site_alpha)
+    views = dict.fromkeys(stream.view for stream in streams)
+    return {view: renderer.start_frame(SCHEMA.views[view].camera) for view in views}
+
+
+def _finished(started: Started, streams: Sequence[Stream], step: int) -> list[Frame]:
+    """Wait for the clean frames of a step, and return the frame of each stream as policies see it."""
+    clean = {view: wait() for view, wait in started.items()}
     return [to_policy(_noisy(clean[stream.view], stream, step)) for stream in streams]
 
 

@@ -3,7 +3,7 @@
 import atexit
 import copy
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import mujoco
@@ -44,6 +44,13 @@ class Renderer:
     def frame(self, camera: str) -> Frame:
         """Render a frame (H, W, 3) of uint8 RGB of the restored state, oriented like LIBERO's raw observations."""
         return self.drawing.frame(self.data, camera)
+
+    def start_frame(self, camera: str) -> Callable[[], Frame]:
+        """Start to render :meth:`frame` of the restored state, and return a function that waits for the frame.
+
+        Another state may be restored meanwhile.
+        """
+        return self.drawing.start_frame(self.data, camera)
 
     def surfaces(self, camera: str) -> Surfaces:
         """Render the depth, and the geom or site, of each pixel of :meth:`frame` in the restored state."""

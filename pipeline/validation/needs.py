@@ -59,8 +59,14 @@ VALIDATE_S = 0.0006
 FIXED_S = 100.0
 """Wall-clock time of starting the stages, previews, sheets and report, with any number of workers."""
 IN_TURN = ("rest", "GPU")
-"""Work that more workers do not speed up. A GPU renders for one process at a time: an H200 gave 770 frames a second to
-4 and to 16 processes, and 600 to one (`benchmarks/gpu.py`)."""
+"""Work whose time is not that of one core. A GPU renders for one process at a time."""
+
+H200_FRAME_S = 0.0015
+"""Time for a plain frame by one process that waits for it, as ``Speed.frame_s``: 2.16 ms with JPEG and state
+(``benchmarks/gpu.py``), which take 0.66 ms."""
+SHARING, H200_FRAMES_PER_S = (2, 4, 8), (853, 1228, 2118)
+"""Processes that share an H200, and its frames per second: in flight for up to 2, in layers for more. 16 get as many
+as 8."""
 
 
 def needed_mb(config: Config) -> dict[str, float]:
@@ -94,8 +100,8 @@ def needed_mb(config: Config) -> dict[str, float]:
 def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     """Estimate the seconds that one core takes for each stage; more cores do not reduce the entries in ``IN_TURN``.
 
-    Rendering optimizations count as gaining as much as on the reference machine. A GPU renders without them, and takes
-    equally long in every arena.
+    Rendering optimizations count as gaining as much as on the reference machine, and on a GPU as much as on an H200. A
+    GPU takes equally long in every arena. Shadows and maps count as gaining nothing there.
 
     Args:
         config: configuration of the run.
@@ -107,7 +113,9 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
     drawn_s = np.average([ARENAS[arena].frame_s for arena in arenas], axis=0, weights=weights)
     slower = speed.frame_s / REFERENCE.frame_s
-    frame_s = [speed.frame_s] * len(drawn_s) if speed.gpus else [float(s) * slower for s in drawn_s]
+    frame_s = [float(s) * slower for s in drawn_s]
+    if speed.gpus:
+        frame_s = [_gpu_frame_s(config.compute, speed)] * len(drawn_s)
     maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in config.render.extras)
     trajectories, rendered_s = amounts.twins, amounts.twin_steps * sum(view_s + maps_s for view_s in frame_s)
     encoded_s = amounts.twin_steps * len(frame_s) * ENCODE_S
@@ -130,6 +138,15 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
         "validate": processor * exported_steps * VALIDATE_S * len(datasets),
         "rest": processor * FIXED_S,
     } | ({"GPU": rendered_s / speed.gpus} if speed.gpus else {})
+
+
+def _gpu_frame_s(compute: ComputeConfig, speed: Speed) -> float:
+    """Estimate the time that a GPU takes for a frame when all workers render.
+
+    Only workers of this machine know how many of them share a GPU (``GlChoice.sharing``).
+    """
+    sharing = workers_of(compute) / speed.gpus if compute.cluster == "local" else 1
+    return speed.frame_s / (H200_FRAME_S * float(np.interp(sharing, SHARING, H200_FRAMES_PER_S)))
 
 
 def in_words(stages_s: Mapping[str, float], workers: int) -> str:

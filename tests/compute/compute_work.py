@@ -26,9 +26,9 @@ def refuse(number: int) -> int:
     return number
 
 
-def gpu(_: int) -> tuple[int, str, str | None]:
+def gpu(_: int) -> tuple[int, str, str | None, int]:
     time.sleep(0.1)
-    return os.getpid(), gl.choose().device, os.environ.get("MUJOCO_EGL_DEVICE_ID")
+    return os.getpid(), gl.choose().device, os.environ.get("MUJOCO_EGL_DEVICE_ID"), gl.choose().sharing
 
 
 def die(_: int) -> int:

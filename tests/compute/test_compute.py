@@ -59,11 +59,11 @@ def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(
     monkeypatch.setattr(gl, "choose", lambda: gl.GlChoice("egl", "two GPUs", "a test"))
     monkeypatch.setattr(gl, "gpus", lambda: ("0", "2"))
     with runner(ComputeConfig(cluster="local", workers=3), tmp_path, renders=True) as run:
-        found = sorted((device, index or "") for _, device, index in set(run(gpu, range(30), "GPUs")))
-        assert found == [("two GPUs", "0"), ("two GPUs", "0"), ("two GPUs", "2")]
+        found = sorted((device, index or "", sharing) for _, device, index, sharing in set(run(gpu, range(30), "GPUs")))
+        assert found == [("two GPUs", "0", 2), ("two GPUs", "0", 2), ("two GPUs", "2", 2)]
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
             run(die, [1], "deaths")
-        assert {(device, index) for _, device, index in run(gpu, range(30), "GPUs")} <= set(found)
+        assert {(device, index, sharing) for _, device, index, sharing in run(gpu, range(30), "GPUs")} <= set(found)
 
 
 def test_progress_is_counted_in_what_items_hold(capsys: pytest.CaptureFixture[str]) -> None:

@@ -78,13 +78,13 @@ class Pair:
 def pair(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]:
     opened = Renderer(scene(shadows=getattr(request, "param", False)))
     with both_ways(opened) as (ours, plain):
-        draw, made = ours._draw, Pair(opened, ours, plain, [])
+        draw, made = ours._draw_geoms, Pair(opened, ours, plain, [])
 
         def counted(shot: Shot, opaque: NDArray[np.bool_], *how: Any, **more: Any) -> None:
             made.drawn.append(int(opaque[-BODIES:].sum()))
             draw(shot, opaque, *how, **more)
 
-        monkeypatch.setattr(ours, "_draw", counted)
+        monkeypatch.setattr(ours, "_draw_geoms", counted)
         yield made
 
 

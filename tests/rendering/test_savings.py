@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -16,8 +17,10 @@ from conftest import REPOSITORY
 from pipeline import gl
 from pipeline.rendering import savings
 from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.in_flight import InFlightDrawing
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.layers import LayersDrawing
 from pipeline.rendering.software.skins import SkinnedMeshes
 
 SCENE = '<mujoco><worldbody><light/><camera name="eye" pos="0 0 3"/><geom size="1" group="1"/></worldbody></mujoco>'
@@ -58,6 +61,16 @@ def test_another_version_or_device_draws_plainly_and_says_so(
     assert other in record.getMessage()
 
 
+@pytest.mark.parametrize(("sharing", "kind"), [(1, InFlightDrawing), (2, InFlightDrawing), (3, LayersDrawing)])
+def test_a_gpu_renders_layers_if_enough_processes_share_it(
+    sharing: int, kind: type, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    on_gpu = replace(gl.choose(), device="NVIDIA H200", sharing=sharing)
+    monkeypatch.setattr(gl, "choose", lambda: on_gpu)
+    assert drawn_by() is kind
+    assert caplog.records == []
+
+
 def test_a_scene_that_shares_no_context_is_drawn_plainly(caplog: pytest.LogCaptureFixture) -> None:
     endless = SCENE.replace("</worldbody>", '<geom type="plane" size="0 0 1" pos="0 0 -1" group="1"/></worldbody>')
     with closing(Renderer(endless)) as renderer:
@@ -70,7 +83,7 @@ def test_other_pixels_of_the_small_scene_draw_plainly(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(savings, "SCENE", savings.SCENE.replace('pos="0.2 0.1 0.1"', 'pos="0.2 0.1 0.2"'))
-    assert savings.fault() is None
+    assert savings.fault(SoftwareDrawing) is None
     put = SkinnedMeshes.put
 
     def wrong(*arguments: object) -> object:

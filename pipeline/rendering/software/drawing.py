@@ -24,7 +24,6 @@ from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay
 from pipeline.rendering.software.samples import SAMPLES
 from pipeline.rendering.software.skins import SkinnedMeshes
-from pipeline.types import Frame
 
 LOOK = tuple(name for name in FIELDS if name != "tex_data")
 """Arrays of a model, without textures, that perturbations may change and on which a picture depends."""
@@ -88,9 +87,14 @@ class Still:
 class SoftwareDrawing(PlainDrawing):
     """Drawing of models that are ``possible``, with all savings.
 
+    Attributes:
+        chooses_faces: True renders large meshes by the faces that cover a sample; False renders all meshes whole.
+
     Raises:
         PipelineError: if OpenGL reports an error.
     """
+
+    chooses_faces = True
 
     def __init__(self, model: mujoco.MjModel):
         # Create the context for the common parts of all scenes, and then switch it to this model.
@@ -133,7 +137,8 @@ class SoftwareDrawing(PlainDrawing):
         shown = self._culling.shown
         rendered = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
         self._meshes = Meshes(self._context, model, rendered, self._meshes)
-        self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, shown, self._skinned)
+        by_faces = shown & self.chooses_faces
+        self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, by_faces, self._skinned)
         self._forget_underlays()
 
     def load(self, textures: Collection[int]) -> None:
@@ -148,15 +153,13 @@ class SoftwareDrawing(PlainDrawing):
         for underlay in self._underlays.values():
             underlay.content = b""
 
-    def frame(self, data: mujoco.MjData, camera: str) -> Frame:
-        """Render a frame like ``PlainDrawing.frame``, with savings."""
-        self._gl.make_current()
+    def _draw(self, data: mujoco.MjData, camera: str) -> None:
+        """Render a picture like ``PlainDrawing``, with savings."""
         shot = Shot(data, camera, self._culling.picture(data, camera))
         if shot.picture.underlaid:
             self._draw_over_still(shot)
         else:
-            self._draw(shot, shot.picture.opaque)
-        return self._pixels()
+            self._draw_geoms(shot, shot.picture.opaque)
 
     def _draw_over_still(self, shot: Shot) -> None:
         """Render a picture over an underlay of the geoms that stand still."""
@@ -172,11 +175,13 @@ class SoftwareDrawing(PlainDrawing):
                 self._underlays[camera] = Underlay(self._context, self._rectangle.height, self._rectangle.width)
             underlay, content = self._underlays[camera], view + still.tobytes() + places[still].tobytes()
             if underlay.content != content:
-                self._draw(shot, still, last=False)
+                self._draw_geoms(shot, still, last=False)
                 underlay.keep(content)
-        self._draw(shot, opaque & ~still, underlay)
+        self._draw_geoms(shot, opaque & ~still, underlay)
 
-    def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
+    def _draw_geoms(
+        self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True
+    ) -> None:
         """Render opaque geoms of a picture over an underlay.
 
         Args:

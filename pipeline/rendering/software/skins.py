@@ -24,7 +24,7 @@ class SkinnedMeshes:
         skins: the context's skins.
         samples: (SAMPLES, 2) place of each sample in its pixel.
         meshes: the display lists of the model's meshes.
-        shown: (ngeom,) geoms that can be rendered.
+        shown: (ngeom,) geoms that can be rendered, and whose faces may be chosen.
         former: the ``SkinnedMeshes`` of the context's former model; its faces are reused.
     """
 

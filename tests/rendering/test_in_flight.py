@@ -1,0 +1,73 @@
+"""Drawings for GPUs give the frames of plain rendering in their order, also while several frames are in flight."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import MILK
+
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.noise import NoiseAxis
+from pipeline.planning.streams import Stream
+from pipeline.rendering import savings
+from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.in_flight import BUFFERS, InFlightDrawing
+from pipeline.rendering.render import frames_of_steps
+from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.layers import LayersDrawing
+from pipeline.scenes.compiled import compiled
+from pipeline.seeding import rng
+from pipeline.types import Frame, Task, Trajectory
+
+KINDS = pytest.mark.parametrize("kind", [InFlightDrawing, LayersDrawing])
+
+
+def states(model: mujoco.MjModel, count: int) -> Iterator[mujoco.MjData]:
+    """Yield the same data with the mocap body in further and further poses."""
+    data = mujoco.MjData(model)
+    for state in range(count):
+        data.mocap_pos[0, 1] = 0.05 * state
+        data.mocap_quat[0] = np.cos(state), np.sin(state), 0, 0
+        mujoco.mj_forward(model, data)
+        yield data
+
+
+@KINDS
+def test_frames_are_plain_frames_with_and_without_shadows(kind: type[PlainDrawing]) -> None:
+    """The mirror, the sky behind and the textures of the small scene show in its frames."""
+    assert all(map(np.array_equal, savings.frames(PlainDrawing), savings.frames(kind)))
+
+
+@KINDS
+def test_more_frames_in_flight_than_buffers_keep_their_order(kind: type[PlainDrawing]) -> None:
+    model, count = mujoco.MjModel.from_xml_string(savings.SCENE), BUFFERS + 3
+    with closing(PlainDrawing(model)) as plain:
+        expected = [plain.frame(data, "eye") for data in states(model, count)]
+    with closing(kind(model)) as drawing:
+        started = [drawing.start_frame(data, "eye") for data in states(model, count)]
+        last_first = [wait() for wait in reversed(started)]
+    assert all(map(np.array_equal, reversed(last_first), expected))
+    assert not any(np.array_equal(frame, following) for frame, following in pairwise(expected))
+
+
+@KINDS
+def test_steps_in_flight_are_yielded_in_order_with_the_noise_of_their_step(
+    kind: type[PlainDrawing], whole: dict[Task, Trajectory]
+) -> None:
+    trajectory = replace(whole[MILK], actions=whole[MILK].actions[:6])
+    moved = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
+    noise = NoiseAxis().sample(rng("in flight"), MILK, 0)
+    streams = [Stream("image", (moved, noise)), Stream("wrist_image", (moved,))]
+
+    def steps_by(drawing_kind: type[PlainDrawing]) -> list[list[Frame]]:
+        model = compiled(trajectory.model_xml)
+        with closing(Renderer(model, drawing_kind(model))) as renderer:
+            return list(frames_of_steps(renderer, trajectory, streams))
+
+    expected, in_flight = steps_by(PlainDrawing), steps_by(kind)
+    assert len(in_flight) == len(expected) == 6
+    assert all(np.array_equal(*pair) for pair in zip(in_flight, expected, strict=True))
