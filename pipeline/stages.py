@@ -13,6 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from pipeline import gl
+from pipeline.clients.files import RECIPE
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import FAILURES
 from pipeline.files import read_json, write, write_json
@@ -265,7 +266,7 @@ def write_recipe(run: Run) -> None:
     export = run.config.export
     built = recipe.build(run.manifest_file, run.manifest, export)
     recipe.write(built, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
-    file = run.path(FINETUNE) / recipe.RECIPE
+    file = run.path(FINETUNE) / RECIPE
     print(f"{file} has the recipe and a command line for each of {', '.join(built['clients'])}")
 
 

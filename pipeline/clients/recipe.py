@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from pipeline.clients.files import LEROBOT_TRAIN, OFT_SCRIPT, OPENPI_ASSETS, RECIPE, STARVLA_CONFIG
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum, read_json
@@ -21,21 +22,10 @@ from pipeline.formats.rlds import Rlds
 from pipeline.formats.rlds_layout import dataset_of, split_of
 from pipeline.generated import generated
 
-RECIPE = "finetune.yaml"
-"""File of the folder ``finetune``."""
-
 TEMPLATES = Path(__file__).parent / "templates"
-OFT_SCRIPT = "run_openvla_oft.py"
-LEROBOT_TRAIN = "lerobot_train.json"
-"""File for lerobot-train with the training episodes, written if a validation split is held out.
-
-A command line with 25,000 episodes would be too long for Linux.
-"""
 
 OPENPI = "pi05_libero"
 """openpi's configuration for training and serving."""
-OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
-"""Path of the statistics below the configuration's assets folder; the configuration reads it to serve a policy."""
 
 EXPORTS = {
     "openvla_oft": "export: {rlds: {}}",
@@ -149,7 +139,7 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
         if lerobot_v21 is not None and lerobot_v21.convention == "ipec":
             roots = sorted(path.name for path in datasets["lerobot_v21"].iterdir() if not path.name.endswith("_val"))
             mixture = _filled("starvla_data_config.py.j2", name=lerobot_v21.name, roots=roots)
-            (unfinished / "starvla_data_config.py").write_text(mixture)
+            (unfinished / STARVLA_CONFIG).write_text(mixture)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -15,7 +15,7 @@ from huggingface_hub import DatasetCardData
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
-from pipeline.clients.recipe import RECIPE
+from pipeline.clients.files import RECIPE
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum, read_json, schema_file
 from pipeline.formats.base import Format

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pipeline.axes import AXES
+from pipeline.clients.files import FILES
 from pipeline.errors import PipelineError
 from pipeline.files import is_temporary
 from pipeline.formats.registry import FORMATS
@@ -28,8 +29,7 @@ CLEARED = {
 MADE = {
     **CLEARED,
     CARD: rf"\.generated\.json|({'|'.join(kind.name for kind in FORMATS)})/(README\.md|SHA256SUMS|pictures/{_SHEET})",
-    FINETUNE: r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|"
-    r"starvla_data_config\.py|openpi_assets/physical-intelligence/libero/norm_stats\.json",
+    FINETUNE: rf"\.generated\.json|__pycache__/[^/]+\.pyc|{'|'.join(map(re.escape, FILES))}",
 }
 """``CLEARED`` with the folders whose stages look for edits themselves. ``clean`` deletes all of them."""
 

@@ -24,6 +24,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from synthetic import IDS, NAME, SET, episode, loop
 
 from pipeline.clients import oft, recipe
+from pipeline.clients.files import OPENPI_ASSETS
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Look, Wanted
 from pipeline.evaluation.rollout import roll_out_policy
@@ -99,7 +100,7 @@ def by_oft(data: Path) -> Round:
 
 def by_openpi(data: Path) -> Round:
     """Quantile normalisation, without a bound; LIBERO's gripper is neither turned nor left out."""
-    figures = json.loads((data / "finetune" / recipe.OPENPI_ASSETS).read_text())["norm_stats"]["actions"]
+    figures = json.loads((data / "finetune" / OPENPI_ASSETS).read_text())["norm_stats"]["actions"]
     low, high = np.array(figures["q01"]), np.array(figures["q99"])
     rows = pq.read_table(data / "lerobot_v21" / NAME / "data", columns=["episode_id", "actions"]).to_pylist()
     actions = np.array([row["actions"] for row in rows])

@@ -23,6 +23,7 @@ from pipeline import stages
 from pipeline.__main__ import main
 from pipeline.commands.command_line import MOVED
 from pipeline.files import edition
+from pipeline.formats.rlds import Rlds
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.run import manifest
 from pipeline.run.claim import claimed
@@ -301,7 +302,7 @@ def test_run_elsewhere_with_a_subset_in_one_format(ablation: Ablation) -> None:
     assert all(row["lerobot_episode_index"] is None for row in rows)
     assert [folder.name for folder in (data / "rlds").iterdir()] == ["libero_tiny_goal"]
     recipe = yaml.safe_load((data / "finetune/finetune.yaml").read_text())
-    assert list(recipe["clients"]) == ["openvla_oft"]
+    assert tuple(recipe["clients"]) == Rlds.clients
     assert [entry.name for entry in (data / "card").iterdir() if entry.is_dir()] == ["rlds"]
     assert "nothing would run" in call(clone, "status", "configs/tiny.yaml").stdout
 

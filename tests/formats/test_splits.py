@@ -25,6 +25,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
 
 from pipeline.clients import recipe
+from pipeline.clients.files import OPENPI_ASSETS
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, Where
 from pipeline.formats.episodes import Episodes, Known, split
@@ -32,6 +33,7 @@ from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobot
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run.export import export
+from pipeline.run.foreign import refuse_foreign_files
 
 DEMOS = {episode_id: f"libero_spatial/task/demo_{number // 2}" for number, episode_id in enumerate(IDS)}
 """Two episodes of each of three demonstrations."""
@@ -194,8 +196,9 @@ def test_what_is_held_out_of_v21_is_a_set_of_its_own(
     rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
     formats = ExportConfig.model_validate({"rlds": rlds, "lerobot": lerobot, "lerobot_v21": options})
     recipe.write({}, tmp_path / "finetune", formats, datasets_in(tmp_path))
+    refuse_foreign_files(tmp_path, ["finetune"])
     if convention == "openpi":
-        found = json.loads((tmp_path / "finetune" / recipe.OPENPI_ASSETS).read_text())["norm_stats"]
+        found = json.loads((tmp_path / "finetune" / OPENPI_ASSETS).read_text())["norm_stats"]
         for key, column in (("actions", "action"), ("state", "state")):
             values = np.concatenate([getattr(episode(one), column) for one in splits["train"]]).astype(np.float64)
             assert np.allclose(found[key]["mean"], values.mean(0), atol=1e-12)
