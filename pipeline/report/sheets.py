@@ -114,7 +114,8 @@ def side_by_side(frames: Sequence[Frame], side_px: int) -> Image.Image:
 
 def name_episode(row: Mapping[str, Any]) -> str:
     """Return the suite, the task and the identifier of an episode, which lead from a picture to its data."""
-    return f"{row['suite']}/{row['task']}, episode {row['episode_id']}"
+    task = row["task"].replace("_", " ")  # Lines break at spaces.
+    return f"{row['suite']}, {task}, episode {row['episode_id']}"
 
 
 def describe_all(perturbations: Sequence[Perturbation]) -> str:

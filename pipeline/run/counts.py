@@ -167,7 +167,7 @@ def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
     from rich.table import Table
 
     suites, axes = named(rows, "suite"), named(tried(rows), "axis")
-    heads = [suite.removeprefix("libero_") for suite in suites]
+    heads = [suite.replace("_", "_\n", 1) for suite in suites]  # Two lines fit into 80 columns.
     target_of = targets(rows, episodes)
     table = Table("axis", *heads, "all", "wanted", title="planned/replayed/kept episodes")
     for column in table.columns[1:]:
