@@ -96,6 +96,7 @@ def write_files(data: Path) -> None:
     for kind in FORMATS:
         record = {"identity": "", "files": {f"{NAME}/data.bin": DATA_SHA256}, "places": {}}
         (data / f"{kind.name}.json").write_text(json.dumps(record))
+    (data / "datasets.json").write_text("{}")
     (data / "sheets").mkdir()
     for axis in ("camera", "camera+background"):
         (data / "sheets" / f"{axis}.png").write_bytes(axis.encode())
