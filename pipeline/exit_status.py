@@ -12,7 +12,10 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 GO_ON = "run the same command again: what is finished is kept"
 
 SURROUNDINGS = {
-    errno.ENOSPC: ("the disk is full", f"make room (`python -m pipeline doctor` says how much is needed), and {GO_ON}"),
+    errno.ENOSPC: (
+        "the disk is full",
+        f"make room (`python -m pipeline doctor CONFIG` says how much), and {GO_ON}",
+    ),
     errno.EDQUOT: ("your share of the disk is used up", f"make room, and {GO_ON}"),
     errno.EROFS: ("this file system cannot be written to", f"mount it for writing, and {GO_ON}"),
     errno.EACCES: ("you may not read or write this", f"change its permissions or its owner, and {GO_ON}"),
@@ -23,7 +26,7 @@ SURROUNDINGS = {
     errno.EISDIR: ("a folder is where a file should be", f"move it away, and {GO_ON}"),
     errno.ELOOP: ("symbolic links lead in a circle", f"remove them, and {GO_ON}"),
     errno.EMFILE: ("too many files are open", f"raise the limit (`ulimit -n 4096`), and {GO_ON}"),
-    errno.EIO: ("the disk has an error", "`python -m pipeline dataset check` says which files are whole"),
+    errno.EIO: ("the disk has an error", "`python -m pipeline dataset check CONFIG` says which files are whole"),
 }
 """Error number of the system to its description and remedy. All other errors are bugs and keep their traceback."""
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, create_model, model_validator
 
+from pipeline.axes.component_names import ComponentName
 from pipeline.formats.base import Format, FormatOptions, Options
 from pipeline.formats.episodes import too_few, validating
 from pipeline.formats.registry import FORMATS
@@ -32,7 +33,7 @@ class Where(Frozen):
     """
 
     axis: tuple[str, ...] | None = Field(default=None, min_length=1)
-    component: tuple[str, ...] | None = Field(default=None, min_length=1)
+    component: tuple[ComponentName, ...] | None = Field(default=None, min_length=1)
     level: tuple[Annotated[int, Field(ge=0, le=5)], ...] | None = Field(default=None, min_length=1)
     suite: tuple[str, ...] | None = Field(default=None, min_length=1)
 

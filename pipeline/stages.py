@@ -298,9 +298,7 @@ def write_card(run: Run) -> None:
     from pipeline.publish import card
 
     card.write(run)
-    print(
-        f"{run.path(CARD)} has a README.md for each format; `python -m pipeline dataset push` uploads it with the data"
-    )
+    print(f"{run.path(CARD)} has a README.md for each format; `dataset push` uploads it with the data")
 
 
 def write_report(run: Run) -> None:

@@ -100,6 +100,7 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
         (1e-320, ("export", "lerobot", "validation"), "export.lerobot.validation"),
         ({"levels": 1}, ("plan", "axes", "camera"), "plan.axes.camera.levels: expected a list, such as [1, 2], got 1"),
         ({"levels": [9]}, ("plan", "axes", "camera"), "plan.axes.camera.levels.0: expected 1, 2, 3, 4 or 5, got 9"),
+        ({"components": None, "distance": None}, ("plan", "axes", "camera"), "plan.axes.camera.components: expected a"),
         ("high", ("render", "jpeg_quality"), "render.jpeg_quality: expected a whole number, got 'high'"),
         ("My run", ("name",), "name: expected a lower-case letter, then lower-case letters, digits or underscores"),
         ({}, ("export", "lerobot_v21"), "export.lerobot_v21.convention: this field is required"),

@@ -322,7 +322,10 @@ class CameraAxis(Axis):
         null = [name for name in get_args(Component) if name in raw and raw[name] is None]
         if not null:
             return raw
-        left = [name for name in raw.get("components", get_args(Component)) if name not in null]
+        components = raw.get("components", get_args(Component))
+        if not isinstance(components, list | tuple):
+            return raw  # The field's own type reports this.
+        left = [name for name in components if name not in null]
         if not left:
             raise ValueError("leave at least one of distance, spherical and orientation")
         return {name: ranges for name, ranges in raw.items() if name not in null} | {"components": left}

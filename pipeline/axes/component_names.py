@@ -1,9 +1,12 @@
-"""Names of components that were renamed; what is stored keeps the former name.
+"""Names of components that were renamed; stored perturbations keep the former name.
 
-Ids of episodes and results are hashes of stored perturbations, so they do not depend on the name that is shown.
+Ids of episodes and results are hashes of stored perturbations, so they do not depend on the name that is shown. Columns
+such as ``component`` of the manifest have the present name.
 """
 
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator
 
 FORMER = {"gaussian_blur": "gaussian"}
 """Name of a component to its former name."""
@@ -21,3 +24,7 @@ def current_names(joined: Any) -> Any:
 def stored_names(joined: str) -> str:
     """Return the names that are stored and hashed, the reverse of ``current_names``."""
     return "+".join(FORMER.get(name, name) for name in joined.split("+"))
+
+
+ComponentName = Annotated[str, BeforeValidator(current_names)]
+"""Name of a component in a filter, which may be a former name."""

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 import click
 from click.shell_completion import CompletionItem
@@ -139,6 +139,8 @@ def _field_option(model: type[BaseModel], name: str, option: str) -> Callable[[A
     kind, default = field.annotation, field.default
     several = isinstance(default, tuple)
     kind_of_value = kind if get_origin(kind) is Literal else next(iter(get_args(kind)), kind)
+    if get_origin(kind_of_value) is Annotated:
+        kind_of_value = get_args(kind_of_value)[0]
     parameter_type: Any = kind_of_value
     if get_origin(kind_of_value) is Literal:
         parameter_type = click.Choice(get_args(kind_of_value))

@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from pipeline.commands.base import LazyGroup, Listed
+from pipeline.exit_status import exit_status
 
 DESCRIPTION = """\
 Generate perturbed fine-tuning data from LIBERO demonstrations.
@@ -71,11 +72,16 @@ def run() -> int:
         Exit status.
     """
     installed = Path(sys.argv[0]).name == "perturbed-libero"
-    try:
-        status: int = top.main(
-            prog_name="perturbed-libero" if installed else "python -m pipeline", standalone_mode=False
-        )
-    except click.ClickException as error:
-        error.show()
-        return error.exit_code
-    return status
+    name = "perturbed-libero" if installed else "python -m pipeline"
+
+    def call() -> int:
+        try:
+            status: int = top.main(prog_name=name, standalone_mode=False)
+        except click.ClickException as error:
+            error.show()
+            return error.exit_code
+        except click.Abort as aborted:  # An interruption while a command was imported or its arguments were read.
+            raise aborted.__cause__ or KeyboardInterrupt from None
+        return status
+
+    return exit_status(call)

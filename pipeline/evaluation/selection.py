@@ -18,6 +18,7 @@ from pydantic import Field
 
 from pipeline.axes import AXES, axes_of, level_of_test
 from pipeline.axes.base import LEVELS, Frozen
+from pipeline.axes.component_names import ComponentName
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_task
@@ -59,7 +60,7 @@ class Selection(Frozen, use_attribute_docstrings=True):
     """only these suites"""
     axes: tuple[str, ...] = ()
     """only these axes"""
-    components: tuple[str, ...] = ()
+    components: tuple[ComponentName, ...] = ()
     """only these components"""
     levels: tuple[int, ...] = ()
     """only these levels"""

@@ -104,7 +104,7 @@ class Episodes:
             raise PipelineError(
                 "no episodes to write",
                 expected="1 or more",
-                remedy="`python -m pipeline status` says what reached its goal; else widen export.where, or filter",
+                remedy="`python -m pipeline status CONFIG` lists kept episodes; else widen export.where, or filter",
             )
         if not validation:
             return {"train": self.ids}

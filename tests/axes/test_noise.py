@@ -20,6 +20,8 @@ from pipeline.axes import from_json, to_json
 from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.axes.noise import Effect, NoiseAxis, NoisePerturbation
 from pipeline.evaluation import libero_plus
+from pipeline.evaluation.selection import Selection
+from pipeline.export_config import Where
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Frame, Task
@@ -446,3 +448,8 @@ def test_a_grid_can_be_configured_but_needs_five_levels() -> None:
     assert NoiseAxis.model_validate({"gaussian_blur": rows}).gaussian_blur[4] == Gaussian(sigma_px=0.9)
     with pytest.raises(ValidationError, match="gaussian_blur"):
         NoiseAxis.model_validate({"gaussian_blur": rows[:4]})
+
+
+def test_filters_take_the_former_name_of_the_blur() -> None:
+    assert Where(component=("gaussian",)).takes("noise", "gaussian_blur", "1", "libero_goal")
+    assert Selection(components=("gaussian", "fog")).components == ("gaussian_blur", "fog")

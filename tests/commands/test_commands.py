@@ -71,6 +71,16 @@ def test_a_moved_command_names_its_new_place(
         assert f"the command `{former}` is now `{present}`" in capsys.readouterr().err
 
 
+def test_an_error_while_a_command_is_imported_has_its_remedy_too() -> None:
+    """The command ``evaluate`` imports the simulator, which chooses a GPU."""
+    elsewhere = {**IN_SCRIPTS, "CUDA_VISIBLE_DEVICES": "0", "MUJOCO_EGL_DEVICE_ID": "3"}
+    command = [sys.executable, "-m", "pipeline", "evaluate", "--help"]
+    done = subprocess.run(command, env=elsewhere, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: MUJOCO_EGL_DEVICE_ID=3 is not among CUDA_VISIBLE_DEVICES=0")
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "position", "offered"),
     [
