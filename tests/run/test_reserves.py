@@ -18,7 +18,7 @@ from pipeline.run.render_job import RenderJob
 from pipeline.run.run import Run
 from pipeline.validation.validate import validate
 
-SEED = 15
+SEED = 2
 """Under it, the camera of the first candidate of layout and camera together shows nothing of the added object."""
 
 
@@ -30,7 +30,7 @@ def reserved(demos: Path) -> dict[str, object]:
             "seed": SEED,
             "axes": {
                 "layout": {"levels": [1]},
-                "camera": {"levels": [5], "distance": None, "spherical": None},
+                "camera": {"levels": [5], "components": ["orientation"], "clear_by": "off"},
             },
             "episodes": {"layout": 1, "layout+camera": 1},
             "reserve": 2.0,
