@@ -17,7 +17,7 @@ test:
 doctor: setup
 	.venv/bin/python -m pipeline doctor configs/starter.yaml
 
-# The documentation in site/index.html, with search.
+# The documentation in build/site/index.html, with search.
 site: setup
 	.venv/bin/python -m mkdocs build --strict
 

@@ -47,10 +47,10 @@ from pipeline.config import RenderConfig
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.rendering.drawing import PlainDrawing
-from pipeline.rendering.in_flight import InFlightDrawing
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.savings import drawing_of, why_plain
 from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.in_flight import InFlightDrawing
 from pipeline.rendering.software.layers import LayersDrawing
 from pipeline.types import Frame, State
 

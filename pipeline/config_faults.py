@@ -103,7 +103,10 @@ def _fields_at(model: type[BaseModel], location: Location) -> list[str]:
             models = []
             for annotation in annotations:
                 models += _models_in(annotation)
-    return list(dict.fromkeys(name for each in models for name in each.model_fields))
+    names: list[str] = []
+    for each in models:
+        names += each.model_fields
+    return list(dict.fromkeys(names))
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
-from pipeline.commands.command_line import top
+from pipeline.commands.command_line import run
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.tasks import STEP_LIMITS
@@ -37,5 +37,4 @@ def result(
 
 def analyze(*arguments: str) -> int:
     """Run the command ``analyze``; return its exit code."""
-    status: int = top.main(["analyze", *arguments], "pipeline", standalone_mode=False)
-    return status
+    return run(["analyze", *arguments])

@@ -1,4 +1,4 @@
-"""Prose of pages, docstrings and messages: short sentences, usual terms, and a noun or a verb at the beginning.
+"""Prose of pages and docstrings: short sentences, usual terms, and a noun or a verb at the beginning.
 
 No maintained linter from the package index checks Markdown and docstrings by rules of one's own, so these few are here.
 """

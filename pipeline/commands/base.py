@@ -1,4 +1,4 @@
-"""Parts of the command line on top of click: lazy groups, commands with an exit status, and shared parameters.
+"""Parts of the command line on top of click: lazy groups, commands, and shared parameters.
 
 Click was chosen over cyclopts and tyro: ``--help`` of a single command took 0.1 s, 0.3 s and 0.5 s with them, and click
 is installed with Dask anyway.
@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args,
 import click
 from click.shell_completion import CompletionItem
 
-from pipeline.exit_status import exit_status
-
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
@@ -26,20 +24,17 @@ if TYPE_CHECKING:
 
 
 class Command(click.Command):
-    """Command whose function returns an exit status, or `None` for 0; errors end it as in ``exit_status``."""
+    """Command whose function returns an exit status, or `None` for 0."""
 
     def invoke(self, context: click.Context) -> int:
-        def call() -> int:
-            try:
-                status = super(Command, self).invoke(context)
-                sys.stdout.flush()  # While a closed pipe can still be handled, unlike when Python ends.
-            except BrokenPipeError:
-                # The reader of the output, such as `head`, has ended. Python must not write to it when it ends.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-                return 0
-            return int(status or 0)
-
-        return exit_status(call)
+        try:
+            status = super().invoke(context)
+            sys.stdout.flush()  # While a closed pipe can still be handled, unlike when Python ends.
+        except BrokenPipeError:
+            # The reader of the output, such as `head`, has ended. Python must not write to it when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        return int(status or 0)
 
 
 class Listed(NamedTuple):

@@ -1,6 +1,7 @@
 """Command line: all commands by their groups; each is defined in another module of this folder."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -65,8 +66,11 @@ top = LazyGroup(
 )
 
 
-def run() -> int:
-    """Call the command that the command line names.
+def run(words: Sequence[str] | None = None) -> int:
+    """Call the command that the command line names; errors end it as in ``exit_status``.
+
+    Args:
+        words: the words after the program's name; by default those of this process.
 
     Returns:
         Exit status.
@@ -76,11 +80,11 @@ def run() -> int:
 
     def call() -> int:
         try:
-            status: int = top.main(prog_name=name, standalone_mode=False)
+            status: int = top.main(words, name, standalone_mode=False)
         except click.ClickException as error:
             error.show()
             return error.exit_code
-        except click.Abort as aborted:  # An interruption while a command was imported or its arguments were read.
+        except click.Abort as aborted:  # Click's own error in place of an interruption.
             raise aborted.__cause__ or KeyboardInterrupt from None
         return status
 

@@ -20,7 +20,6 @@ import numpy as np
 from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.rendering.drawing import PlainDrawing
-from pipeline.rendering.in_flight import InFlightDrawing
 from pipeline.types import Frame
 
 PLAIN = "PLAIN_RENDERING"
@@ -93,6 +92,8 @@ def kind_with_savings(choice: gl.GlChoice) -> type[PlainDrawing]:
 
         return SoftwareDrawing
     if choice.sharing < SHARING:
+        from pipeline.rendering.software.in_flight import InFlightDrawing
+
         return InFlightDrawing
     from pipeline.rendering.software.layers import LayersDrawing
 

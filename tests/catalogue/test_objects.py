@@ -22,7 +22,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Package, catalogue
 from pipeline.catalogue.objects import TEST_CATEGORIES, find, goes_with, models, taken
 from pipeline.catalogue.sources import Folder
-from pipeline.commands.command_line import top
+from pipeline.commands.command_line import run
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.seeding import rng
@@ -167,7 +167,7 @@ def test_a_model_that_is_gone_is_back_once_the_remedy_was_followed(folder: Path,
     models.cache_clear()
     with pytest.raises(PipelineError, match="run `python -m pipeline sources CONFIG`"):
         find(house.name, sha256)
-    assert top.main(["sources", str(config)], "pipeline", standalone_mode=False) == 0
+    assert run(["sources", str(config)]) == 0
     assert find(house.name, sha256) == house
 
 

@@ -30,8 +30,8 @@ from pipeline.run.claim import claimed
 
 HELP = """
 import sys
-from pipeline.commands.command_line import top
-top.main(["--help"], "pipeline", standalone_mode=False)
+from pipeline.commands.command_line import run
+run(["--help"])
 print(sorted({"numpy", "pydantic", "yaml", "rich", "h5py"}.intersection(sys.modules)))
 """
 

@@ -15,9 +15,9 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.planning.streams import Stream
 from pipeline.rendering import savings
 from pipeline.rendering.drawing import PlainDrawing
-from pipeline.rendering.in_flight import BUFFERS, InFlightDrawing
 from pipeline.rendering.render import frames_of_steps
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.in_flight import BUFFERS, InFlightDrawing
 from pipeline.rendering.software.layers import LayersDrawing
 from pipeline.scenes.compiled import compiled
 from pipeline.seeding import rng

@@ -17,9 +17,9 @@ from conftest import REPOSITORY
 from pipeline import gl
 from pipeline.rendering import savings
 from pipeline.rendering.drawing import PlainDrawing
-from pipeline.rendering.in_flight import InFlightDrawing
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.in_flight import InFlightDrawing
 from pipeline.rendering.software.layers import LayersDrawing
 from pipeline.rendering.software.skins import SkinnedMeshes
 

@@ -4,8 +4,8 @@ A GPU renders a face in less time than a process takes to choose it, so meshes a
 leave out whole geoms, which takes less of the processes' time.
 """
 
-from pipeline.rendering.in_flight import InFlightDrawing
 from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.in_flight import InFlightDrawing
 
 
 class LayersDrawing(InFlightDrawing, SoftwareDrawing):
