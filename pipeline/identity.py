@@ -34,7 +34,7 @@ RECIPES: dict[Step, int] = {
     "physics": 8,
     "pixels": 6,
     "encoding": 1,
-    "evaluation": 2,
+    "evaluation": 3,
     "checks": 8,
     "pictures": 7,
 }

@@ -1,6 +1,6 @@
-"""Prose of pages and docstrings: short sentences, usual terms, and a noun or a verb at the beginning.
+"""Prose of pages, docstrings, messages and templates: short sentences, usual terms, and a noun or a verb at the beginning.
 
-No maintained linter from the package index checks Markdown and docstrings by rules of one's own, so these few are here.
+No maintained linter from the package index checks Python sources by rules of one's own, so these few are here.
 """
 
 import ast
@@ -16,12 +16,29 @@ PAGES = sorted([REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *(REPO
 SOURCES = sorted(
     file for room in ("pipeline", "stages", "examples", "benchmarks") for file in (REPOSITORY / room).rglob("*.py")
 )
+TEMPLATES = sorted((REPOSITORY / "pipeline").glob("[pr]*/templates/*.j2"))
 EXCEPTIONS = [entry["text"] for entry in yaml.safe_load(Path(__file__).with_name("prose_exceptions.yaml").read_text())]
 
 MOST_WORDS, MOST_NUMBERS = 30, 2
 FIRST_WORDS = {"What", "Of", "How", "Whether", "So", "Have", "Or", "Where", "As", "By", "Those"}
-TERMS = {"anew": "again", "goes on": "resumes", "kept clear of": "at least X away from", "hold against": "compare with"}
-"""Words to avoid, and the term to use."""
+TERMS = {
+    r"dr(aw|aws|awn|awing|ew)": "sample, of a perturbation, or render",
+    r"(a|the|first|its) looks?": "observation",
+    r"refus\w*": "reject",
+    r"told|said|says": "report or state",
+    r"made|making": "generate, or a more exact verb",
+    r"anew": "again",
+    r"goes? on": "resume",
+    r"beside": "next to, or in addition to",
+    r"(keep|keeps|kept) clear of": "at least X away from",
+    r"(hold|held) against": "compare with",
+    r"(is|are|found|nothing) off": "error or difference",
+    r"(?<!clean )twins?": "clean twin",
+    r"whoever": "the noun",
+    r"what": "the noun",
+    r"those that": "the noun",
+}
+"""Words to avoid, as regular expressions, and the term to use."""
 
 BLOCKS = re.compile(r"^```.*?^```|<!--.*?-->", re.MULTILINE | re.DOTALL)
 PARAGRAPH_END = re.compile(r"\n\s*\n|\n(?=\s*(?:[*-]|\d+\.|#+|\|) )")
@@ -45,7 +62,9 @@ def faults(sentence: str, numbers: bool) -> Iterator[str]:
         yield f"{len(NUMBER.findall(sentence))} numbers"
     if words and words[0].strip('*_"“(') in FIRST_WORDS:
         yield f"begins with {words[0]}"
-    yield from (f"{word!r}, write {term!r}" for word, term in TERMS.items() if re.search(rf"\b{word}\b", sentence))
+    for word, term in TERMS.items():
+        if match := re.search(rf"\b({word})\b", sentence):
+            yield f"{match.group()!r}, write {term}"
 
 
 def wrong(text: str, numbers: bool = False) -> list[str]:
@@ -64,6 +83,30 @@ def docstrings(file: Path) -> Iterator[str]:
             yield node.value.value
 
 
+def messages(file: Path) -> Iterator[str]:
+    """Yield the strings of a file with four words or more that are no docstrings, with X for inserted values."""
+    tree = ast.parse(file.read_text())
+    skipped = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr):
+            skipped.add(node.value)
+        elif isinstance(node, ast.JoinedStr):
+            skipped.update(node.values)
+    for node in ast.walk(tree):
+        if node in skipped or not isinstance(node, ast.Constant | ast.JoinedStr):
+            continue
+        values = [getattr(part, "value", None) for part in getattr(node, "values", [node])]
+        text = "".join(value if isinstance(value, str) else "X" for value in values)
+        if len(text.split()) >= 4:
+            yield text
+
+
+def words_of(template: Path) -> str:
+    """Return the text of a template, a paragraph for each of its elements."""
+    shown = re.sub(r"{{.*?}}", "X", re.sub(r"{[%#].*?[%#]}", "\n\n", template.read_text(), flags=re.DOTALL))
+    return re.sub(r"<(style|script).*?</\1>|<[^>]*>", "\n\n", shown, flags=re.DOTALL)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_pages(page: Path) -> None:
     assert wrong(page.read_text(), numbers=True) == []
@@ -71,6 +114,15 @@ def test_pages(page: Path) -> None:
 
 def test_docstrings() -> None:
     assert [f"{file.name}: {fault}" for file in SOURCES for text in docstrings(file) for fault in wrong(text)] == []
+
+
+def test_messages() -> None:
+    assert [f"{file.name}: {fault}" for file in SOURCES for text in messages(file) for fault in wrong(text)] == []
+
+
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.name)
+def test_templates(template: Path) -> None:
+    assert wrong(words_of(template)) == []
 
 
 @pytest.mark.parametrize(

@@ -151,11 +151,12 @@ class BackgroundAxis(Axis):
         components: which of them, each as often as the other.
         sources: where textures come from. ``metaworld`` and ``gymnasium-robotics`` are wheels that pip downloads
             (63 MB) when a plan first draws from them; the others are there.
-        own_colours: how often a draw shows all its textures in their own colours, whatever its level.
+        own_colours: share of perturbations that show all their textures in their own colours, as all test tasks do.
+            Such a perturbation has level 5. There is none if ``levels`` lacks 5.
         map_share: how often such a draw has a data map on the working surface, as 751 of LIBERO-Plus's 1,076
             background tests do, where ``sources`` name ``procedural``.
         image_share: how often an image is drawn rather than a procedural colour map, of which there are many more.
-        colour_scale: for each level, how much of the new texture's own average colour shows in the other draws.
+        colour_scale: for each level, how much of the new texture's own average colour the other perturbations show.
     """
 
     draws: ClassVar = (BackgroundPerturbation,)
@@ -173,7 +174,9 @@ class BackgroundAxis(Axis):
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
         component = pick(rng, self.components)
         level = self.draw_level(rng)
-        own_colours = rng.random() < self.own_colours
+        own_colours = rng.random() < self.own_colours and 5 in self.levels
+        if own_colours:
+            level = 5
         return BackgroundPerturbation(
             component=component,
             level=level,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, Level, Perturbation, PhysicsPerturbation, pick, point
+from pipeline.axes.base import LEVELS, Axis, Frozen, Level, Perturbation, PhysicsPerturbation, Share, pick, point
 from pipeline.axes.report_data import (
     BENCHMARK,
     CoveragePlots,
@@ -223,11 +223,13 @@ class ScenePerturbation(_PosePerturbation):
 
     Attributes:
         moves: displacement of each thing by its name in the BDDL file. A thing on or in another moves with it.
+        disk_level: level of the disks, if things first got LIBERO-Plus's places; ``level`` is then 5.
     """
 
     axis: Literal["pose"] = "pose"
     component: Literal["scene"] = "scene"
     moves: Annotated[tuple[Move, ...], Field(min_length=1)]
+    disk_level: Level | None = Field(default=None, exclude_if=lambda level: level is None)
 
     # A test scene is one stored state. LIBERO's reset put each thing anywhere in a square around the middle of its
     # moved region. The side of the square is 2 cm in the spatial and goal suites and 5 cm in most of the others. From
@@ -285,28 +287,25 @@ def displacements(parameters: Mapping[str, object]) -> Shifts:
     return {name: (float(dx_m), float(dy_m)) for name, dx_m, dy_m in listed}
 
 
-def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePerturbation:
+def sample_scene(rng: np.random.Generator, level: Level, task: Task, places_m: Shifts) -> ScenePerturbation:
     """Sample moves uniform over the disks of a level, again if they break the scene that the task's file defines.
 
     The file gives the middle of each thing's region. At the new places the relation that the instruction names must
-    hold, and the hand must reach the objects that it has to grasp. No two things may come much closer than before. In
-    the goal suite, things first get the places of LIBERO-Plus, except the bowl, which the hand could not grasp there.
+    hold, and the hand must reach the objects that it has to grasp. No two things may come much closer than before.
+
+    Args:
+        places_m: displacements of things before those of the disks.
     """
     definition = bddl.read(task.bddl_file)
     carriers, centres_m = definition.carriers, definition.centres_m
     radius_m = level * _disk_m(task)
-    base_m = {}
-    if task.suite == "libero_goal":
-        for name, shift in BASE_M.items():
-            if _within_reach(task, name, np.add(centres_m[name], shift)):
-                base_m[name] = shift
     for _ in range(DRAWS):
         shifts = {}
         for carrier in dict.fromkeys(carriers.values()):
             reach_m = radius_m * math.sqrt(rng.uniform())
             bearing_rad = rng.uniform(-math.pi, math.pi)
             offset_m = [reach_m * math.cos(bearing_rad), reach_m * math.sin(bearing_rad)]
-            shifts[carrier] = np.round(np.add(base_m.get(carrier, (0.0, 0.0)), offset_m), 4)
+            shifts[carrier] = np.round(np.add(places_m.get(carrier, (0.0, 0.0)), offset_m), 4)
         xy_m = {thing: np.add(centres_m[thing], shifts[carrier]) for thing, carrier in carriers.items()}
         if _fits(task, xy_m):
             break
@@ -315,6 +314,18 @@ def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePertu
         dx_m, dy_m = shifts[carrier]
         moves.append(Move(name=thing, dx_m=float(dx_m), dy_m=float(dy_m)))
     return ScenePerturbation(level=level, moves=tuple(moves))
+
+
+def _benchmark_places_m(task: Task) -> Shifts:
+    """Return the displacements of ``BASE_M`` for a task of the goal suite, if the hand can then reach the object."""
+    if task.suite != "libero_goal":
+        return {}
+    centres_m = bddl.read(task.bddl_file).centres_m
+    places_m = {}
+    for name, shift in BASE_M.items():
+        if _within_reach(task, name, np.add(centres_m[name], shift)):
+            places_m[name] = shift
+    return places_m
 
 
 def _disk_m(task: Task) -> float:
@@ -354,15 +365,17 @@ def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
 
 
 class PoseAxis(Axis):
-    """Displacements in all directions with equal chance.
+    """Displacements in all directions with equal probability.
 
-    The component ``scene`` moves everything at once, as LIBERO-Plus does: see ``draw_scene``. The others move and turn
-    one object; where there are several to choose from, one is drawn.
+    The component ``scene`` moves everything at once, as LIBERO-Plus does: see ``sample_scene``. The others move and
+    turn one object, sampled from those that the task has.
 
     Attributes:
-        components: what to move.
+        components: moved parts of the scene.
+        benchmark_places: share of the goal suite's scenes in which three objects first get LIBERO-Plus's places, up to
+            35 cm away. Such a scene has level 5, and disks of any level. There is none if ``levels`` lacks 5.
         step_m: at level k one object is moved by k - 1 to k times this, uniform over the ring.
-        turn_deg: one object is turned by up to so much to either side, uniform, whatever the level.
+        turn_deg: one object is turned by up to this angle to either side, uniform, at every level.
     """
 
     draws: ClassVar = (PosePerturbation, ScenePerturbation)
@@ -372,6 +385,7 @@ class PoseAxis(Axis):
     test_scene: ClassVar = "bddl"
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("scene",)
+    benchmark_places: Share = 1.0
     step_m: float = Field(default=0.016, ge=0.0001, le=0.2)
     turn_deg: float = Field(default=20.0, ge=0.0, le=180.0)
 
@@ -395,17 +409,29 @@ class PoseAxis(Axis):
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
-        """Return the benchmark's own level, which sets the radius of its disks."""
-        return int(tested.parameters["level"])
+        """Return the benchmark's own level, which sets the radius of its disks; in the goal suite 5.
+
+        There, objects first get places that are up to 35 cm away.
+        """
+        return 5 if tested.suite == "libero_goal" else int(tested.parameters["level"])
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
         component, moved = pick(rng, self._choices(task))
         level = self.draw_level(rng)
         if component == "scene":
-            return draw_scene(rng, level, task)
+            return self._sample_scene(rng, level, task)
         dx_m, dy_m = point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
         turn_deg = round(rng.uniform(-self.turn_deg, self.turn_deg), 2)
         return PosePerturbation(level=level, component=component, moved=moved, dx_m=dx_m, dy_m=dy_m, dyaw_deg=turn_deg)
+
+    def _sample_scene(self, rng: np.random.Generator, level: Level, task: Task) -> ScenePerturbation:
+        """Sample a scene from LIBERO's own places, or in the goal suite from the benchmark's."""
+        places_m = _benchmark_places_m(task)
+        if not places_m or 5 not in self.levels or rng.random() >= self.benchmark_places:
+            return sample_scene(rng, level, task, places_m={})
+        disk_level = pick(rng, LEVELS)
+        scene = sample_scene(rng, disk_level, task, places_m)
+        return scene.model_copy(update={"level": 5, "disk_level": disk_level})
 
     @classmethod
     def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:

@@ -124,13 +124,21 @@ def family(covering: Covering) -> str:
     return covering.texture.partition(":")[2].partition("/")[0]
 
 
+def test_own_colours_are_level_5() -> None:
+    """Half of the perturbations and a fifth of the others; a configuration without the level has none of them."""
+    sampled = [BackgroundAxis().sample(rng("own", key), MILK, 0) for key in range(600)]
+    assert all(one.colour_scale == BackgroundAxis().colour_scale[one.level - 1] for one in sampled)
+    assert 0.55 < mean(one.level == 5 for one in sampled) < 0.65
+    weak = BackgroundAxis(levels=(1, 2))
+    assert {weak.sample(rng("own", key), MILK, 0).colour_scale for key in range(100)} == {0.2, 0.4}
+
+
 def test_half_of_the_draws_have_their_own_colours_and_show_every_kind_of_map() -> None:
-    """Levels below 5, which by itself is all in own colours."""
-    weak = BackgroundAxis(levels=(1, 2, 3, 4))
-    draws = [weak.sample(rng("own", key), MILK, 0) for key in range(600)]
+    """A colour scale of 0.9 at level 5 tells the others of this level from those in own colours."""
+    axis = BackgroundAxis(colour_scale=(0.2, 0.4, 0.6, 0.8, 0.9))
+    draws = [axis.sample(rng("own", key), MILK, 0) for key in range(600)]
     own = [one for one in draws if one.colour_scale == 1]
     assert 0.45 < len(own) / len(draws) < 0.55
-    assert all(one.colour_scale in {1.0, weak.colour_scale[one.level - 1]} for one in draws)
     worked_on = [family(one.coverings[-1]) for one in own]
     assert 0.63 < mean(name in DATA_MAPS for name in worked_on) < 0.77
     elsewhere = [c for one in draws for c in one.coverings if c.part != "surface" or one not in own]
@@ -147,7 +155,7 @@ def test_what_is_in_its_own_colours_is_the_image_as_it_is() -> None:
         <material name="table_texture" texture="t"/></asset>
         <worldbody><geom type="plane" size="1 1 1" material="table_texture"/></worldbody></mujoco>"""
     )
-    axis = BackgroundAxis(components=("surface",), levels=(1,), own_colours=1, map_share=1)
+    axis = BackgroundAxis(components=("surface",), own_colours=1, map_share=1)
     for key in range(20):
         one = axis.sample(rng("as it is", key), MILK, 0)
         (covering,) = one.coverings
