@@ -68,6 +68,7 @@ class ExportConfig(_Formats):
     Attributes:
         rlds, lerobot: null leaves a format out.
         lerobot_v21: the same episodes for clients that read LeRobot's older version.
+        lerobot_openpi: the same episodes in openpi's convention of this version, also next to ``lerobot_v21``.
         where: a subset of the kept episodes; all of them when left out.
         failures: write replays that missed their goal too, into sets of their own below ``failures/``.
     """

@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NewType
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+from pipeline.field_docs import field_docs, summary
 
 if TYPE_CHECKING:
     import mujoco
@@ -30,6 +34,18 @@ class Frozen(BaseModel):
     """An immutable record that rejects unknown fields and numbers that are not finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON schema with a description of each field, which editors show."""
+        schema = handler(core)
+        described = handler.resolve_ref_schema(schema)
+        described["description"] = summary(cls)
+        documented = field_docs(cls)
+        for name, properties in described.get("properties", {}).items():
+            if name in documented:
+                properties["description"] = documented[name]
+        return schema
 
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]

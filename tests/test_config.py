@@ -20,6 +20,7 @@ from pipeline.commands.develop import schemas
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.export_config import Where
+from pipeline.field_tables import with_tables
 from pipeline.libero.assets import libero_folder
 from pipeline.run.finished import settings_of
 
@@ -47,6 +48,18 @@ def test_every_config_is_valid_and_named_after_its_file(file: Path) -> None:
 def test_schema_file_is_that_of_the_code(name: str) -> None:
     stored = json.loads((REPOSITORY / "schemas" / name).read_text())
     assert stored == schemas()[name], "run: python -m pipeline schema"
+
+
+def test_the_page_of_fields_is_that_of_the_code() -> None:
+    """Each model that a configuration contains has its table, and each field its values, default and description."""
+    page = (REPOSITORY / "docs" / "fields.md").read_text()
+    schema = schemas()["config.schema.json"]
+    assert with_tables(page, schema) == page, "run: python -m pipeline schema"
+    models = {name for name, model in schema["$defs"].items() if "properties" in model}
+    assert set(re.findall(r"<!-- fields: (\w+) -->", page)) == models - {"Axes"} | {"Config"}
+    assert "| `jpeg_quality` | whole number, 50 to 100 | `95` |" in page
+    assert "| `turn_deg` | number, 0 to 180 | `20` |" in page
+    assert re.findall(r"^\|.*\| *\|$", page, re.MULTILINE) == ["| field | values | default | |"] * page.count("<!-- f")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Prose of pages, docstrings, messages and templates: short sentences, usual terms, and a noun or a verb at the beginning.
+"""Prose of pages, docstrings, messages and templates: short sentences, usual terms, a noun or a verb at the beginning.
 
 No maintained linter from the package index checks Python sources by rules of one's own, so these few are here.
 """

@@ -17,7 +17,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
-from pipeline.formats.lerobot import LeRobot, LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotOpenpi, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.rlds_layout import dataset_of, split_of
 from pipeline.generated import generated
@@ -34,8 +34,8 @@ EXPORTS = {
     "lerobot_pi05": "export: {lerobot: {}}",
     "starvla": "export: {lerobot_v21: {convention: ipec}}",
     "gr00t": "export: {lerobot_v21: {convention: ipec}}",
-    "openpi": "export: {lerobot_v21: {convention: openpi}}",
-    "openpi_serve": "export: {lerobot_v21: {convention: openpi}}",
+    "openpi": "export: {lerobot_openpi: {}}",
+    "openpi_serve": "export: {lerobot_openpi: {}}",
 }
 """Client to the setting of a run's configuration that exports the format that it reads."""
 
@@ -92,9 +92,19 @@ def _training_and_clients(export: ExportConfig, oft_validates: bool) -> dict[str
     values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
+    values |= {"ipec_set": _v21_of(export, "ipec"), "openpi_set": _v21_of(export, "openpi")}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
     missing = {client: setting for client, setting in EXPORTS.items() if client not in sections["clients"]}
     return {**sections, "clients_of_other_formats": missing} if missing else sections
+
+
+def _v21_of(export: ExportConfig, convention: str) -> tuple[str, str] | None:
+    """Return the format of v2.1 in a convention that a run exports, and its name; ``None`` if it exports none."""
+    for kind in (LeRobotV21, LeRobotOpenpi):
+        options: LeRobotV21Config | None = export.options_for(kind)
+        if options is not None and options.convention == convention:
+            return kind.name, options.name
+    return None
 
 
 def _filled(template: str, **values: object) -> str:
@@ -119,7 +129,8 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
     Raises:
         PipelineError: if edits in ``finetune`` would be lost.
     """
-    lerobot, lerobot_v21 = export.options_for(LeRobot), export.options_for(LeRobotV21)
+    lerobot = export.options_for(LeRobot)
+    ipec, openpi = _v21_of(export, "ipec"), _v21_of(export, "openpi")
     with generated(folder) as unfinished:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
@@ -130,15 +141,17 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
             info = read_json(datasets["lerobot"] / lerobot.name / "meta" / "info.json")
             episodes = [*range(int(info["splits"]["train"].partition(":")[2]))]
             (unfinished / LEROBOT_TRAIN).write_text(json.dumps({"dataset": {"episodes": episodes}}) + "\n")
-        if lerobot_v21 is not None and lerobot_v21.convention == "openpi":
-            table = pq.read_table(datasets["lerobot_v21"] / lerobot_v21.name / "data", columns=["actions", "state"])
+        if openpi is not None:
+            format_name, name = openpi
+            table = pq.read_table(datasets[format_name] / name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
             (unfinished / OPENPI_ASSETS).parent.mkdir(parents=True)
             content = json.dumps(exact_statistics.openpi(actions, states), indent=1) + "\n"
             (unfinished / OPENPI_ASSETS).write_text(content)
-        if lerobot_v21 is not None and lerobot_v21.convention == "ipec":
-            roots = sorted(path.name for path in datasets["lerobot_v21"].iterdir() if not path.name.endswith("_val"))
-            mixture = _filled("starvla_data_config.py.j2", name=lerobot_v21.name, roots=roots)
+        if ipec is not None:
+            format_name, name = ipec
+            roots = sorted(path.name for path in datasets[format_name].iterdir() if not path.name.endswith("_val"))
+            mixture = _filled("starvla_data_config.py.j2", name=name, roots=roots)
             (unfinished / STARVLA_CONFIG).write_text(mixture)
 
 

@@ -9,6 +9,7 @@ import click
 from pipeline.commands.base import Command
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
+PAGE = SCHEMAS.parent / "docs" / "fields.md"
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -23,9 +24,13 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 @click.command(cls=Command)
 def schema() -> None:
-    """Write the files of schemas/ that follow from the code."""
+    """Write the files of schemas/ and the tables of docs/fields.md that follow from the code."""
+    from pipeline.field_tables import with_tables
     from pipeline.files import write
 
-    for name, content in schemas().items():
+    contents = schemas()
+    for name, content in contents.items():
         write(SCHEMAS / name, json.dumps(content, indent=2) + "\n")
         print(f"wrote {SCHEMAS / name}")
+    write(PAGE, with_tables(PAGE.read_text(), contents["config.schema.json"]))
+    print(f"wrote {PAGE}")

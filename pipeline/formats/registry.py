@@ -6,13 +6,14 @@ from typing import Any
 import pyarrow as pa
 
 from pipeline.formats.base import Format
-from pipeline.formats.lerobot import LeRobot, LeRobotV21
+from pipeline.formats.lerobot import LeRobot, LeRobotOpenpi, LeRobotV21
 from pipeline.formats.rlds import Rlds
 
 FORMATS: tuple[type[Format[Any]], ...] = (
     Rlds,
     LeRobot,
     LeRobotV21,
+    LeRobotOpenpi,
 )
 
 

@@ -63,9 +63,37 @@ def test_a_client_without_its_format_is_named_with_the_setting_that_exports_it(
     assert not missing.keys() & recipe["clients"].keys()
     assert {"openpi", "gr00t", "starvla"} <= missing.keys() | recipe["clients"].keys()
     for client, setting in missing.items():
-        written = yaml.safe_load(setting)["export"]["lerobot_v21"]
-        export = export_config(lerobot_v21={"name": NAME, **written})
+        ((name, written),) = yaml.safe_load(setting)["export"].items()
+        export = export_config(**{name: {"name": NAME, **written}})
         assert client in tiny_recipe(tmp_path, export)["clients"]
+
+
+def test_a_run_of_both_conventions_has_all_clients(tmp_path: Path) -> None:
+    """Each reads the folder of its convention."""
+    export = export_config(
+        lerobot_v21={"name": NAME, "convention": "ipec"}, lerobot_openpi={"name": NAME, "validation": 0.1}
+    )
+    recipe = tiny_recipe(tmp_path, export)
+    assert "clients_of_other_formats" not in recipe
+    assert "$DATA/lerobot_openpi " in recipe["clients"]["openpi"]["command"]
+    assert "$DATA/lerobot_v21 " in recipe["clients"]["starvla"]["command"]
+    named = [client for dataset in export.datasets(tmp_path) for client in dataset.clients]
+    assert sorted(named) == sorted(recipe["clients"])
+
+
+def test_openvla_oft_has_the_same_batch_on_any_number_of_gpus(tmp_path: Path) -> None:
+    recipe = tiny_recipe(tmp_path)
+    client = recipe["clients"]["openvla_oft"]
+    training = {name: field["value"] for name, field in recipe["training"].items()}
+    assert [setting["gpus"] for setting in client["hardware"]["settings"]] == [8, 4, 2, 1]
+    for setting in client["hardware"]["settings"]:
+        if "replace" in setting:
+            option, gpus = setting["replace"].split()
+            assert (f"{option} {training['gpus']} " in client["command"], int(gpus)) == (True, setting["gpus"])
+        words = setting.get("append", "").split()
+        appended = {option: int(value) for option, value in zip(words[::2], words[1::2], strict=True)}
+        batch = setting["gpus"] * appended.get("--batch_size", training["batch_size_per_gpu"])
+        assert batch * appended.get("--grad_accumulation_steps", 1) == training["effective_batch_size"]
 
 
 def test_clients_of_formats_that_are_left_out_are_named(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 import yaml
-from conftest import STOVE, dvc, run_stages, tiny_config
+from conftest import REPOSITORY, STOVE, dvc, run_stages, tiny_config
 from dvc.repo import Repo  # type: ignore[import-untyped]
 from PIL import Image
 from synthetic import records
@@ -114,6 +115,33 @@ def test_tfds_reads_what_the_manifest_says(finished: Path, rows: list[dict[str, 
         assert np.array_equal(read["state"], episode.state)
         assert set(read["language_instruction"].tolist()) == {row["instruction"]}
         assert all(frame in record for frames in episode.frames.values() for frame in frames), "JPEG bytes, unchanged"
+
+
+def printed_by_code_of(page: str, block: int, run: Path) -> str:
+    """Return what a block of Python of a page prints, with the tests' run in place of ``data/starter``."""
+    code = re.findall(r"^```python\n(.*?)^```", (REPOSITORY / page).read_text(), re.MULTILINE | re.DOTALL)[block]
+    for starter, tiny in (
+        ("data/starter/lerobot/libero_perturbed", str(run / "lerobot" / "tiny")),
+        ("data/starter/rlds", str(run / "rlds")),
+        ("libero_perturbed_goal", "libero_tiny_goal"),
+    ):
+        code = code.replace(starter, tiny)
+    assert "perturbed" not in code.replace('LeRobotDataset("libero_perturbed"', "")
+    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+
+
+def test_the_readmes_code_prints_an_episode_and_its_labels(finished: Path, rows: list[dict[str, Any]]) -> None:
+    printed = printed_by_code_of("README.md", 0, finished)
+    kept = [row for row in rows if row["kept"]]
+    first = min(kept, key=lambda row: int(row["lerobot_episode_index"]))
+    assert all(first[label] in printed for label in ("instruction", "episode_id", "axis", "component"))
+    assert "observation.state torch.Size([8])" in printed
+    assert "action torch.Size([7])" in printed
+
+
+@pytest.mark.parametrize("block", [0, 1])
+def test_the_code_of_the_page_on_formats_opens_the_datasets(finished: Path, block: int) -> None:
+    assert printed_by_code_of("docs/formats-and-clients.md", block, finished) == ""
 
 
 def test_conventions(finished: Path, rows: list[dict[str, Any]]) -> None:

@@ -201,6 +201,20 @@ class LeRobotV21Config(FormatOptions):
     validation: Share = 0.0
 
 
+class LeRobotOpenpiConfig(LeRobotV21Config):
+    """Options of the LeRobot dataset of version 2.1 for openpi.
+
+    Attributes:
+        convention: always ``openpi``.
+    """
+
+    convention: Literal["openpi"] = "openpi"
+
+
+CLIENTS_V21 = {"ipec": ("starvla", "gr00t"), "openpi": ("openpi", "openpi_serve")}
+"""Convention to the clients of ``finetune.yaml`` that read it."""
+
+
 class LeRobotV21(Format[LeRobotV21Config]):
     """Sets of v2.1, in which each episode has files of its own.
 
@@ -223,7 +237,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
         self.keys = {name: self.convention.name(key) for name, key in LeRobot.keys.items()}
         if self.convention.open_is_one:
             self.gripper = GripperSpec(open=1.0, close=0.0)
-        self.clients = {"ipec": ("starvla", "gr00t"), "openpi": ("openpi", "openpi_serve")}[options.convention]
+        self.clients = CLIENTS_V21[options.convention]
 
     def step_kb(self, sizes: StepSizes) -> float:
         return self.convention.step_kb(sizes)
@@ -272,8 +286,8 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         actions = self.keys["action"]
         return f"""\
-The repository is laid out as the folder that `finetune/` expects, here `$DATA`; below `lerobot_v21/` lies a dataset in
-the convention `{self.options.convention}` for each folder, with the actions as `{actions}`:
+The repository is laid out as the folder that `finetune/` expects, here `$DATA`. Each folder below `{self.name}/` is a
+dataset in the convention `{self.options.convention}`, with the actions as `{actions}`:
 
 ```sh
 export DATA=$PWD/{name}
@@ -288,9 +302,17 @@ from pathlib import Path
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-for root in sorted(Path(os.environ["DATA"], "lerobot_v21").iterdir()):
+for root in sorted(Path(os.environ["DATA"], "{self.name}").iterdir()):
     dataset = LeRobotDataset(root.name, root=root)
 ```
 
 `meta/provenance.parquet` of each has the provenance of each `episode_index`.
 """
+
+
+class LeRobotOpenpi(LeRobotV21):
+    """The set of v2.1 for openpi in a folder of its own, so that a run may have both conventions."""
+
+    name: ClassVar = "lerobot_openpi"
+    title: ClassVar = "LeRobot v2.1 for openpi"
+    options_type: ClassVar = LeRobotOpenpiConfig

@@ -35,7 +35,6 @@ from pipeline.formats.lerobot.columns import (
     video_path_v21,
 )
 from pipeline.formats.lerobot.read import (
-    NAME_V21,
     VERSION_V21,
     copy_of,
     episode_files,
@@ -275,7 +274,7 @@ def check_v21(
     Raises:
         PipelineError: when a set cannot be opened.
     """
-    split_of: dict[str, str] = {}
+    dataset, split_of = folder.name, dict[str, str]()
     for root in sets_v21(folder):
         with readable(root, VERSION_V21):
             _, rows, _ = opened_v21(root)
@@ -283,19 +282,19 @@ def check_v21(
             wrong = list(_wrong_statistics_v21(root, convention, extras))
         yield from (("format", fault) for fault in faults)
         for what, expected in wrong:
-            yield "format", Fault(NAME_V21, None, f"{root.name}: {what}", expected)
+            yield "format", Fault(dataset, None, f"{root.name}: {what}", expected)
         for episode_id in rows.keys() & split_of.keys():
-            yield "ids", Fault(NAME_V21, episode_id, f"is in {root.name} and in another set", "one set")
+            yield "ids", Fault(dataset, episode_id, f"is in {root.name} and in another set", "one set")
         split_of |= dict.fromkeys(rows, "val" if root.name.endswith("_val") else "train")
     if len(split_of) != len(kept):
-        yield "ids", Fault(NAME_V21, None, f"{len(split_of)} episodes", f"{len(kept)}")
+        yield "ids", Fault(dataset, None, f"{len(split_of)} episodes", f"{len(kept)}")
     # Reading the episodes reports missing ones.
     for episode_id in split_of.keys() - kept.keys():
-        yield "ids", Fault(NAME_V21, episode_id, "is in the dataset", "kept episodes alone")
+        yield "ids", Fault(dataset, episode_id, "is in the dataset", "kept episodes alone")
     splits, wanted = set(split_of.values()), {"train", "val"} if validation else {"train"}
     if splits != wanted:
-        yield "format", Fault(NAME_V21, None, f"the sets are for {sorted(splits)}", f"{sorted(wanted)}")
-    yield from in_both_splits(NAME_V21, split_of, kept)
+        yield "format", Fault(dataset, None, f"the sets are for {sorted(splits)}", f"{sorted(wanted)}")
+    yield from in_both_splits(dataset, split_of, kept)
 
 
 def _format_v21(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[Fault]:
@@ -321,25 +320,25 @@ def _format_v21(root: Path, convention: Convention, extras: tuple[Extra, ...]) -
         "video_path": VIDEO_PATH_V21 if videos else None,
         "features": columns,
     }
-    within = f"{root.name}: "
-    yield from unlike(NAME_V21, info, wanted, within)
+    dataset, within = root.parent.name, f"{root.name}: "
+    yield from unlike(dataset, info, wanted, within)
     existing = [file.relative_to(root).as_posix() for file in root.glob("*/chunk-*/**/*") if file.is_file()]
     stated = [line["episode_index"] for line in read_lines(root / "meta" / "episodes_stats.jsonl")]
     read = {"fields of info.json": sorted(info), "files": sorted(existing), "episodes with statistics": stated}
     expected = {"fields of info.json": sorted(wanted), "files": sorted(files), "episodes with statistics": indices}
-    yield from unlike(NAME_V21, read, expected, within)
+    yield from unlike(dataset, read, expected, within)
     lines = read_lines(root / "meta" / "episodes.jsonl")
     read = {"episode_index": [line.get("episode_index") for line in lines]}
     read["fields of episodes.jsonl"] = sorted({tuple(sorted(line)) for line in lines})
     expected = {"episode_index": [*range(len(rows))]}
     expected["fields of episodes.jsonl"] = [("episode_id", "episode_index", "length", "tasks")]
-    yield from unlike(NAME_V21, read, expected, within)
-    yield from _wrong_tasks(NAME_V21, tasks, [row["tasks"][0] for row in rows.values()])
+    yield from unlike(dataset, read, expected, within)
+    yield from _wrong_tasks(dataset, tasks, [row["tasks"][0] for row in rows.values()])
     if convention.open_is_one:
-        yield from _wrong_modality(NAME_V21, root, columns, convention)
+        yield from _wrong_modality(dataset, root, columns, convention)
     # The videos of a set are alike: only the first of each view is opened here. Reading episodes decodes frames of all.
     for key in videos:
-        yield from _wrong_video(NAME_V21, root / video_path_v21(indices[0], key), info["features"][key]["info"])
+        yield from _wrong_video(dataset, root / video_path_v21(indices[0], key), info["features"][key]["info"])
 
 
 def _wrong_statistics_v21(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[tuple[str, str]]:

@@ -302,7 +302,7 @@ def _video(file: Edition) -> av.container.InputContainer:
 # Version 2.1.
 
 
-NAME_V21, VERSION_V21 = "lerobot_v21", "v2.1"
+VERSION_V21 = "v2.1"
 
 
 def open_all_v21(folder: Path) -> None:
@@ -358,7 +358,7 @@ def _copy_v21(
     numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
     statistics = Statistics(_statistics_v21(root, index), numbers, keys)
     frames = decoded(table["timestamp"].to_pylist(), videos)
-    return Copy(NAME_V21, made, instructions, frames, marks, {}, statistics=statistics)
+    return Copy(root.parent.name, made, instructions, frames, marks, {}, statistics=statistics)
 
 
 def _statistics_v21(root: Path, index: int) -> dict[str, Any]:
