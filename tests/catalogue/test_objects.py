@@ -326,13 +326,13 @@ def test_models_that_would_change_their_meaning_are_refused(geom: str, tmp_path:
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        (None, "", r"mine: there are no models here(?s:.*)<category>/<name>\.obj"),
+        (None, "", r"mine: the folder has no models(?s:.*)<category>/<name>\.obj"),
         ("can_of_soda/x.obj", HOUSE.replace("5", "0.05").replace("20", "0.2"), "can_of_soda"),
-        ("Cube/x.obj", HOUSE, "'Cube' is no category"),
+        ("Cube/x.obj", HOUSE, "'Cube' is not a category"),
         ("dot/dot.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", r"dot\.obj"),
         ("house/house.obj", HOUSE, r"house\.obj: the model measures 20 m(?s:.*)at most 0\.5 m"),
         ("cube/x.xml", "<mujoco", r"x\.xml"),
-        ("cube/x.xml", "<mujoco><worldbody/></mujoco>", r"x\.xml: .*nothing to touch"),
+        ("cube/x.xml", "<mujoco><worldbody/></mujoco>", r"x\.xml: .*no collision geometry"),
         ("cube/x.xml", TWISTED, r"mine/cube/x\.xml: MuJoCo cannot use the model"),
         ("cube/x.xml", BEREFT, r"mine/cube/x\.xml: MuJoCo cannot use the model(?s:.*)lost\.obj"),
     ],

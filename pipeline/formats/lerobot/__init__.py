@@ -272,8 +272,8 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         actions = self.keys["action"]
         return f"""\
-The repository is laid out as the folder that `finetune/` expects, here `$DATA`; below `lerobot_v21/` lies a dataset in
-the convention `{self.options.convention}` for each folder, with the actions as `{actions}`:
+The repository has the layout that `finetune/` expects of the folder `$DATA`. Each folder below `lerobot_v21/` is a
+dataset in the convention `{self.options.convention}`, with the actions as `{actions}`:
 
 ```sh
 export DATA=$PWD/{name}
