@@ -130,7 +130,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3)
     parser.add_argument("--processes", type=int, nargs="+", default=[1, 4, 8, 16])
     parser.add_argument("--drawings", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="NAME")
-    parser.add_argument("--states", type=int, default=12, help="of each scene, in which pixels are compared")
+    parser.add_argument(
+        "--states", type=int, default=12, help="number of states of each scene in which pixels are compared"
+    )
     arguments = parser.parse_args()
     if arguments.pack:
         pack(arguments.folder)

@@ -36,7 +36,7 @@ STEP_S = 0.05
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("data", type=Path, help="a finished run's folder, or one of demonstrations")
+    parser.add_argument("data", type=Path, help="folder of a finished run or of demonstrations")
     parser.add_argument("--limit", type=int, help="number of trajectories; all by default")
     arguments = parser.parse_args()
     is_run = (arguments.data / "plan.parquet").exists()

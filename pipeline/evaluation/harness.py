@@ -97,7 +97,9 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             self._evaluation = Evaluation(episodes, policy, policy.identity(), Path(out), archive=self._archive)
         elif label:
             raise PipelineError(
-                f"no folder for the rows of {label!r}", where="label", remedy="set out: DIR in addition to label"
+                f"there is no folder for the rows of {label!r}",
+                where="label",
+                remedy="set out: DIR in addition to label",
             )
         self._next_look = NextLook(self._environment.settings.look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)

@@ -32,8 +32,8 @@ AS_RECORDED = (
 """Remedy for an undamaged file whose content has another form."""
 
 _REPACK = (
-    "write a copy without compression, `h5repack -f NONE FILE COPY` (package hdf5-tools), where the filter's plugin is "
-    "installed: HDF5 has filters such as blosc not built in"
+    "write a copy without compression, `h5repack -f NONE FILE COPY` (package hdf5-tools), on a machine with the "
+    "filter's plugin: HDF5 itself lacks filters such as blosc"
 )
 REMEDIES = {
     "consistency flags": "copy the file, and clear the mark in the copy by `h5clear -s COPY` (package hdf5-tools): its "

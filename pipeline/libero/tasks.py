@@ -24,7 +24,7 @@ Same = Literal["task", "scene"]
 
 _OF_FILES = ("scene", "suite", "libero", "bddl", "benchmark", "hdf", "demo")
 _DEBRIS = re.compile(rf"[_\d/\\]|\b({'|'.join(_OF_FILES)})\b", re.IGNORECASE)
-WITHOUT_DEBRIS = f"an instruction without digits, _, /, \\ and the words {', '.join(_OF_FILES)}, as of a file's name"
+WITHOUT_DEBRIS = f"an instruction without digits, _, /, \\ and the words {', '.join(_OF_FILES)} of file names"
 
 _TESTED = re.compile(
     r"(?P<base>.+?)(?:_language_\d+|_view(?:_\d+){5}_initstate_\d+|_noise_\d+|_table_\d+|_tb_\d+|_light_\d+|_add_\d+"

@@ -260,7 +260,7 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
         none = f"{len(without)} of {len(counts)} tasks have no demonstration under {root}, such as {without[0]}"
         remedy = "set demos.root to the folder of the suites, and demos.tasks to the tasks that it has"
         return Diagnosis("demos", "fail", none, f"get <suite>/<task>_demo.hdf5 of these tasks; or {remedy}")
-    detail = f"{sum(counts.values())} in {len(counts)} tasks under {root}"
+    detail = f"{sum(counts.values())} demonstrations of {len(counts)} tasks under {root}"
     few = [name for name, count in counts.items() if count < (demos.per_task or 1)]
     if few:
         short = f"{detail}; {len(few)} tasks have fewer than {demos.per_task}, such as {few[0]} with {counts[few[0]]}"

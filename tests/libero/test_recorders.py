@@ -155,8 +155,8 @@ def test_large_actions_are_limited_and_counted(root: Path) -> None:
     assert (len(index.entries), index.problems) == (2, [])
     (note,) = index.notes
     assert note == (
-        f"{file_in(root)}: 2 actions of 1 demonstrations, such as demo_0, are limited to [-1, 1], as robosuite does when "
-        "it executes them"
+        f"{file_in(root)}: 2 actions of 1 demonstrations, such as demo_0, are limited to [-1, 1], as robosuite does "
+        "when it executes them"
     )
     executed = HDF5Source(root).load(f"{NAME}/demo_0").actions
     expected = large.copy()
