@@ -72,7 +72,7 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
                 "episodes": {"language+layout": 4},
             },
             ("plan",),
-            "language with added objects needs distraction or paraphrase",
+            "if objects are added, axes.language.components must contain distraction or paraphrase",
         ),
         ({"camera": {"distance": {"distance_scale": [[[2, 1]]] * 5}}}, ("plan", "axes"), "with low <= high"),
         ({"camera": {"distance": {"distance_scale": [[[0, 1]]] * 5}}}, ("plan", "axes"), "a positive multiple"),

@@ -177,7 +177,7 @@ def test_an_object_that_is_gone_or_another_is_refused(wedge: ObjectModel) -> Non
     ):
         located(stored, "here")
     hull.unlink()
-    with pytest.raises(PipelineError, match=r"hull.obj is not there"):
+    with pytest.raises(PipelineError, match=r"hull.obj of an added object is missing"):
         located(stored, "here")
 
 

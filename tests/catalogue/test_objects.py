@@ -142,7 +142,7 @@ def test_without_the_package_the_error_names_it_and_what_works(folder: Path, mon
     monkeypatch.setenv("PATH", "")
     with pytest.raises(PipelineError, match="sweethome3d-furniture") as raised:
         models(("libero", "sweethome3d"))
-    assert "libero, robosuite and a folder work without it" in str(raised.value)
+    assert "libero, robosuite and a folder do not need it" in str(raised.value)
     assert [left.name for left in folder.iterdir()] == [".lock"]
 
 

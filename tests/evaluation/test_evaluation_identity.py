@@ -340,7 +340,7 @@ def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path)
     [
         ([EvaluationTask("libero_plus", STOVE.suite, STOVE.name, "a", "camera", "", 1, 0)], "libero_plus never start"),
         ([EvaluationTask("goals", STOVE.suite, STOVE.name, "a", "goal", "", 0, 0)], "goals never start"),
-        ([libero_task(STOVE, 0), libero_task(STOVE, 1)], "2 episodes of libero_goal/.* would be the same"),
+        ([libero_task(STOVE, 0), libero_task(STOVE, 1)], "2 episodes of libero_goal/.* would be equal"),
     ],
     ids=["test tasks", "goals", "libero"],
 )

@@ -65,7 +65,7 @@ def test_a_file_of_which_all_miss_is_a_fault(root: Path) -> None:
         del file["data/demo_0"]
     file_of(root, BOWL).unlink()
     (fault,) = checked(root, replays=2).faults
-    assert fault.startswith(f"{file_of(root, STOVE)} data/demo_1: misses its goal, as do all")
+    assert fault.startswith(f"{file_of(root, STOVE)} data/demo_1: the demonstration misses its goal, like all")
     assert "(goal_not_reached)" in fault
 
 
