@@ -289,11 +289,11 @@ class HDF5Source:
         with hdf5.opened(path) as file:
             masks = hdf5.masks(file)
             if masks:
-                yield f"{path}: mask/ ({', '.join(masks)}) is ignored, and all demonstrations of data/ are used"
+                yield f"{path}: mask/ ({', '.join(masks)}) is ignored: all demonstrations of data/ are used"
         if clipped:
             yield (
-                f"{path}: {sum(clipped.values())} actions of {len(clipped)} demonstrations, such as "
-                f"{next(iter(clipped))}, are limited to [-1, 1], as robosuite does when it executes them"
+                f"{path}: {sum(clipped.values())} actions of {len(clipped)} demonstrations are limited to [-1, 1], as "
+                f"robosuite does when it executes them (first: {next(iter(clipped))})"
             )
 
     def _read(self, task: Task, key: str, data: h5py.Group) -> Demo:

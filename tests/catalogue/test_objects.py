@@ -319,7 +319,7 @@ def test_models_that_would_change_their_meaning_are_refused(geom: str, tmp_path:
     file = tmp_path / "model.xml"
     file.write_text(f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>")
     mujoco.MjModel.from_xml_path(str(file))
-    with pytest.raises(PipelineError, match="no quat"):
+    with pytest.raises(PipelineError, match="other than quat"):
         _ = ObjectModel("own/x", "x", "", "", file).shape
 
 

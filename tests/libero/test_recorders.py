@@ -155,8 +155,8 @@ def test_large_actions_are_limited_and_counted(root: Path) -> None:
     assert (len(index.entries), index.problems) == (2, [])
     (note,) = index.notes
     assert note == (
-        f"{file_in(root)}: 2 actions of 1 demonstrations, such as demo_0, are limited to [-1, 1], as robosuite does "
-        "when it executes them"
+        f"{file_in(root)}: 2 actions of 1 demonstrations are limited to [-1, 1], as robosuite does when it executes "
+        "them (first: demo_0)"
     )
     executed = HDF5Source(root).load(f"{NAME}/demo_0").actions
     expected = large.copy()
@@ -174,9 +174,7 @@ def test_mask_groups_are_named_as_ignored(root: Path) -> None:
         file["mask/train"], file["mask/valid"] = [b"demo_0"], [b"demo_1"]
     index = HDF5Source(root).index([TASK])
     assert len(index.entries) == 2
-    assert index.notes == (
-        f"{file_in(root)}: mask/ (train, valid) is ignored, and all demonstrations of data/ are used",
-    )
+    assert index.notes == (f"{file_in(root)}: mask/ (train, valid) is ignored: all demonstrations of data/ are used",)
 
 
 def test_a_file_of_a_killed_recorder_is_cleared_and_not_deleted(root: Path) -> None:

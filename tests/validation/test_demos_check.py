@@ -133,7 +133,7 @@ def test_what_is_ignored_or_limited_is_noted(root: Path) -> None:
     found = checked(root)
     assert found.faults == []
     assert [note.split(": ", 1)[1].split(",")[0] for note in found.notes] == [
-        "mask/ (train) is ignored, and all demonstrations of data/ are used",
+        "mask/ (train) is ignored: all demonstrations of data/ are used",
         "1 actions of 1 demonstrations are limited to [-1",
     ]
 
