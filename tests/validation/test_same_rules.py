@@ -91,8 +91,8 @@ def test_a_gripper_between_open_and_closed(tmp_path: Path) -> None:
     for gripper, told in (
         (-1.0, None),
         (1.0, None),
-        (0.2, "gripper has the command 0.2"),
-        (0.0, "gripper has the command 0"),
+        (0.2, "the gripper has the command 0.2"),
+        (0.0, "the gripper has the command 0"),
     ):
         recorded(file, gripper)
         faults = [
