@@ -42,7 +42,7 @@ from pipeline.types import Trajectory
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--config", type=Path, default=Path("configs/starter.yaml"))
-    parser.add_argument("--tasks", nargs="+", help="default: those of the configuration")
+    parser.add_argument("--tasks", nargs="+", help="tasks; by default those of the configuration")
     arguments = parser.parse_args()
     config = sliced(load(arguments.config), arguments.tasks)
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, benchmark.load())

@@ -8,8 +8,8 @@ A model server replays demonstrations for all commands. Every command runs the s
 - our command in one process, and with one worker on each core, its default;
 - our default with answers in chunks of eight, with one observation per eight steps.
 
-Imports, environments and results are counted. The last line is the result as JSON: wall and CPU seconds, without those
-of the server.
+The times include imports, environments and results. The last line is the result as JSON: wall and CPU seconds, without
+those of the server.
 """
 
 import argparse

@@ -63,7 +63,7 @@ class Clock:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--frames", type=int, default=80, help="of each camera")
+    parser.add_argument("--frames", type=int, default=80, help="number of frames of each camera")
     arguments = parser.parse_args()
     config, drawn = load(Path("configs/starter.yaml")), Clock("mjr_render", "mjr_readPixels")
     figures: dict[str, dict[str, dict[str, float]]] = {}

@@ -1,16 +1,16 @@
-"""Measures of a GPU's rendering: frames per second of 1 to 16 processes by each drawing, and their pixels.
+"""Measures of a GPU's rendering: frames per second of 1 to 16 processes by each kind of rendering, and their pixels.
 
     python benchmarks/gpu.py --pack FOLDER
     python benchmarks/gpu.py FOLDER [--seconds 3] [--processes 1 4 8 16] [--drawings plain layers ...] [--states 12]
 
 The first call replays one demonstration of each task of ``TASKS``, and packs the scenes with their meshes and images.
-The second call needs no LIBERO and no robosuite. It compares the frames of each drawing with plain frames of the same
+The second call needs no LIBERO and no robosuite. It compares the frames of each kind with plain frames of the same
 device, in all scenes, with and without shadows. Then some processes render the states of the first scene with both
 cameras, JPEG included, each process in its own context, with the environment of a run's workers. A last round for each
-drawing measures the time that parts of the work take.
+kind measures the time that parts of the work take.
 
-The last line is JSON with the device, the drawings that a run with 1 worker and with the largest number would use, and
-for each drawing:
+The last line is JSON with the device, the kinds that a run with 1 worker and with the largest number would use, and for
+each kind:
 
 - the number of compared frames, of frames with other pixels, and the largest difference in grey levels;
 - for each number of processes: frames per second, CPU time of a frame, peak memory, the GPU's load by ``nvidia-smi``;
@@ -65,7 +65,7 @@ TASKS = {
 Frames = np.ndarray[Any, np.dtype[np.uint8]]
 
 _FILE = re.compile(r'\sfile\w*="')
-"""Begin of an attribute that names a file."""
+"""Beginning of an attribute that names a file."""
 
 KINDS: dict[str, type[PlainDrawing]] = {
     "plain": PlainDrawing,
@@ -130,7 +130,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3)
     parser.add_argument("--processes", type=int, nargs="+", default=[1, 4, 8, 16])
     parser.add_argument("--drawings", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="NAME")
-    parser.add_argument("--states", type=int, default=12, help="of each scene, in which pixels are compared")
+    parser.add_argument(
+        "--states", type=int, default=12, help="number of states of each scene in which pixels are compared"
+    )
     arguments = parser.parse_args()
     if arguments.pack:
         pack(arguments.folder)
@@ -234,7 +236,7 @@ def fault_of(answers: Sequence[Any]) -> str | None:
 
 
 def compared(workers: Sequence[Connection], names: Sequence[str], states: int) -> list[Any]:
-    """Return for each drawing the comparison with plain frames, or an error."""
+    """Return the comparison with plain frames for each kind of rendering, or an error."""
     answers: list[Any] = []
     for first in range(0, len(names), len(workers)):
         some = names[first : first + len(workers)]
@@ -243,12 +245,12 @@ def compared(workers: Sequence[Connection], names: Sequence[str], states: int) -
 
 
 def opened(workers: Sequence[Connection], name: str) -> str | None:
-    """Create a drawing in all workers, and return an error if there is one."""
+    """Create a ``PlainDrawing`` of a kind in all workers, and return an error if there is one."""
     return fault_of(asked(workers, [("open", name)] * len(workers)))
 
 
 def rendered(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
-    """Measure the open drawings of some workers at a time."""
+    """Measure some workers with an open ``PlainDrawing`` at the same time."""
     with gpu_load() as loads:
         done = asked(workers, [("render", seconds)] * len(workers))
     fault = fault_of(done)
@@ -264,7 +266,7 @@ def rendered(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
 
 
 def profiled(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
-    """Return the milliseconds of a frame by part of the work, the mean of some workers with open drawings."""
+    """Return the milliseconds of a frame by part of the work, the mean of workers with an open ``PlainDrawing``."""
     done = asked(workers, [("profile", seconds)] * len(workers))
     fault = fault_of(done)
     if fault:
@@ -394,7 +396,7 @@ def profile(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
 
 
 def compare(folder: Path, name: str, states: int) -> Pixels:
-    """Compare the frames of a drawing with plain frames, in all scenes, with and without shadows."""
+    """Compare the frames of a kind of rendering with plain frames, in all scenes, with and without shadows."""
     frames = other = most_levels = 0
     plain_frames = list(frames_of_scenes(folder, PlainDrawing, states))
     for plain, ours in zip(plain_frames, frames_of_scenes(folder, KINDS[name], states), strict=True):
@@ -405,7 +407,7 @@ def compare(folder: Path, name: str, states: int) -> Pixels:
 
 
 def frames_of_scenes(folder: Path, kind: type[PlainDrawing], states: int) -> Iterator[Frames]:
-    """Yield the frames of each scene, without and with shadows; a drawing adopts the following scenes if it can."""
+    """Yield the frames of each scene, without and with shadows; following scenes share a context if possible."""
     with ExitStack() as opened:
         drawing: PlainDrawing | None = None
         for task, shadows in product(TASKS, (False, True)):

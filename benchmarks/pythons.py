@@ -93,8 +93,8 @@ def contents(data: Path) -> Iterator[tuple[str, str, str]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="for environments and runs; new")
-    parser.add_argument("--python", action="append", help="as uv takes it: a version or a path; may come again")
+    parser.add_argument("folder", type=Path, help="new folder for environments and runs")
+    parser.add_argument("--python", action="append", help="version or path, as for uv; may be repeated")
     arguments = parser.parse_args()
     folder: Path = arguments.folder.resolve()
     folder.mkdir(parents=True)

@@ -48,7 +48,9 @@ LOOK_S = 0.5
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--config", type=Path, default=Path("configs/full.yaml"))
-    parser.add_argument("--episodes", type=int, nargs="+", default=[1000, 28000], help="kept ones, without twins")
+    parser.add_argument(
+        "--episodes", type=int, nargs="+", default=[1000, 28000], help="kept episodes, without clean twins"
+    )
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     demonstrations(load(arguments.config).demos)

@@ -110,7 +110,7 @@ def dask_setup(worker: object) -> None:
 if __name__ == "__main__":
     sys.argv = sys.argv[1:]
     if Path(sys.argv[0]).stem == "doctor":
-        # doctor steps and renders for some seconds, whatever the size; the disk is not going to be filled.
+        # doctor steps and renders for some seconds at any size, and the run does not fill the disk.
         vars(pipeline.validation.doctor)["needed_mb"] = lambda config: {}
     else:
         put_in()

@@ -43,7 +43,7 @@ from pipeline.types import Frame
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--config", type=Path, default=Path("configs/starter.yaml"))
-    parser.add_argument("--tasks", nargs="+", help="default: those of the configuration")
+    parser.add_argument("--tasks", nargs="+", help="tasks; by default those of the configuration")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     config = sliced(load(arguments.config), arguments.tasks)

@@ -36,8 +36,8 @@ STEP_S = 0.05
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("data", type=Path, help="a finished run's folder, or one of demonstrations")
-    parser.add_argument("--limit", type=int, help="trajectories; all when left out")
+    parser.add_argument("data", type=Path, help="folder of a finished run or of demonstrations")
+    parser.add_argument("--limit", type=int, help="number of trajectories; all by default")
     arguments = parser.parse_args()
     is_run = (arguments.data / "plan.parquet").exists()
     trajectories = _of_run(arguments.data) if is_run else _of_demonstrations(arguments.data)
@@ -115,7 +115,7 @@ def repeated(env: Any, done: Done) -> str | None:
     for _ in range(settled):
         env.step([0.0] * 6 + [-1.0])
     if not np.array_equal(env.get_sim_state(), done.states[0]):
-        return f"another first look after {settled} steps"
+        return f"another first observation after {settled} steps"
     for number, action in enumerate(done.actions, 1):
         push = done.scene.push
         if push is not None:

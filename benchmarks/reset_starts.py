@@ -38,9 +38,9 @@ SEED = 39
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--starts", type=int, default=3, help="of each demonstration; at least 2")
+    parser.add_argument("--starts", type=int, default=3, help="starts of each demonstration; at least 2")
     parser.add_argument("--tasks", nargs="+", default=list(DemosConfig().tasks))
-    parser.add_argument("--workers", type=int, help="one for each core when left out")
+    parser.add_argument("--workers", type=int, help="number of workers; one for each core by default")
     arguments = parser.parse_args()
     demos = DemosConfig(tasks=tuple(arguments.tasks))
     planned = {entry.task: plan.resets([entry], arguments.starts, 0.0, SEED, REPLAY) for entry in demos.index().entries}

@@ -42,7 +42,7 @@ from pipeline.types import Floats, Task, Trajectory
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("kept", type=Path, help="file of results so far")
+    parser.add_argument("kept", type=Path, help="file of the results")
     arguments = parser.parse_args()
     arguments.kept.parent.mkdir(parents=True, exist_ok=True)
     arguments.kept.touch()

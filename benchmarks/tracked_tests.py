@@ -2,7 +2,7 @@
 
     nice -n 10 python benchmarks/tracked_tests.py [--task 'libero_goal/turn_on*'] [--axis pose robot] [--per-task 12]
 
-The yield bounds what the generator can teach of these tasks: a dataset holds such replays, from other starts. Each
+The yield bounds the generator's contribution to these tasks: a dataset holds such replays, from other starts. Each
 replay runs in the test task's own environment and knows the positions of objects. Nothing of it is stored or trained
 on. The last line is JSON: the endings of the episodes for each axis and task.
 """
@@ -35,7 +35,7 @@ REST_STEPS = 10
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--task", nargs="+", default=["libero_[!9]*/*"], help="patterns of <suite>/<task>")
-    parser.add_argument("--axis", nargs="+", default=["pose", "robot"], help="of LIBERO-Plus's tasks (both)")
+    parser.add_argument("--axis", nargs="+", default=["pose", "robot"], help="axes of LIBERO-Plus's tasks (both)")
     parser.add_argument("--per-task", type=int, default=3, help="test tasks of each task and axis (3)")
     arguments = parser.parse_args()
     environment = EpisodeEnvironment()

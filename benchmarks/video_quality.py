@@ -2,8 +2,8 @@
 
     nice -n 10 python benchmarks/video_quality.py [--tasks SUITE/TASK ...]
 
-Measured are both views without noise, and the agent view with each noise at its strongest. The last line is the result
-as JSON.
+The script measures both views without noise, and the agent view with each noise at its strongest. The last line is the
+result as JSON.
 """
 
 import argparse

@@ -34,7 +34,7 @@ def main(run: Path) -> None:
                 mask, pose = seen[f"{view}_segmentation"][..., 0] == place, seen["object_poses"][place]
                 if mask.any() and pose.any():
                     off_m = np.linalg.norm(points_m[mask].mean(axis=0) - pose[:3])
-                    print(f"{folder.parent.name} {view}: {name} on {mask.sum()} pixels, {off_m:.3f} m off its place")
+                    print(f"{folder.parent.name} {view}: {name} on {mask.sum()} pixels, {off_m:.3f} m from its place")
 
 
 def back_project(view: str, seen: Mapping[str, Array], metadata: Mapping[str, Array]) -> Array:

@@ -34,7 +34,7 @@ class ClosedEyes(PredictModelServer):  # type: ignore[misc]
         self._place_m = np.array([x_m, y_m, z_m])
 
     def predict(self, obs: dict[str, Any], ctx: SessionContext) -> dict[str, Any]:
-        """Return a chunk of actions (10, 7). A policy with open eyes uses the images and the instruction, too."""
+        """Return a chunk of actions (10, 7). A policy with open eyes also uses the images and the instruction."""
         distance_m = self._place_m - obs["states"][:3]
         action = np.zeros(7)
         action[:3] = np.clip(distance_m / (CHUNK * UNIT_M), -1.0, 1.0)

@@ -91,7 +91,7 @@ class Client:
         hub = self._out / "hub"
 
         class Local:
-            """Calls of huggingface_hub's client that ``push_to_hub`` makes."""
+            """Methods of huggingface_hub's client that ``push_to_hub`` calls."""
 
             def upload_folder(self, *, folder_path: Any, ignore_patterns: Any = None, **_: Any) -> None:
                 shutil.copytree(folder_path, hub, ignore=shutil.ignore_patterns(*(ignore_patterns or ())))

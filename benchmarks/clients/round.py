@@ -1,7 +1,7 @@
 """Round trip of demonstrations through a client's own normalisation, then as a policy's actions in an evaluation.
 
 The first command runs in the client's environment, see ``read_v21.py``, and writes the file ACTIONS. ROOT is a v2.1
-dataset of a run on starter demonstrations, of which the clean twins are taken:
+dataset of a run on starter demonstrations, whose clean twins are used:
 
     HF_LEROBOT_HOME=.../lerobot_v21 uv run python .../round.py openpi ROOT ASSETS ACTIONS
     PYTHONPATH=. ENV/bin/python .../round.py gr00t ROOT ACTIONS
@@ -39,7 +39,7 @@ def clean(root: Path) -> list[dict[str, Any]]:
 
 
 def openpi(root: Path, assets: Path) -> Iterator[Any]:
-    """Yield each twin's actions after the transforms that ``create_trained_policy`` composes after the model.
+    """Yield each clean twin's actions after the transforms that ``create_trained_policy`` composes after the model.
 
     The dataset's chunks take the place of the model's chunks.
     """
@@ -62,7 +62,7 @@ def openpi(root: Path, assets: Path) -> Iterator[Any]:
 
 
 def gr00t(root: Path) -> Iterator[Any]:
-    """Yield each twin's actions after normalisation and back.
+    """Yield each clean twin's actions after normalisation and back.
 
     The gripper is converted last, as in ``gr00t/eval/sim/LIBERO/libero_env.py``, whose import needs LIBERO.
     """

@@ -161,7 +161,11 @@ def run(*words: str) -> None:
     path = os.pathsep.join(filter(None, folders))
     done = subprocess.run([sys.executable, *words], env={**os.environ, "PYTHONPATH": path}, check=False)
     if done.returncode:
-        raise PipelineError(f"ended with {done.returncode}", where=" ".join(words), remedy="see above, and run again")
+        raise PipelineError(
+            f"ended with {done.returncode}",
+            where=" ".join(words),
+            remedy="read the output above, and run the command again",
+        )
 
 
 def _cpu_s() -> float:

@@ -86,8 +86,8 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
                 raise PipelineError(
                     f"{len(kept)} of {experiment.episodes} episodes of {arm} are kept; missing are {dict(counts)}",
                     where=experiment.data,
-                    expected="as many in all arms",
-                    remedy="raise plan.reserve there for perturbed episodes, or spare in the experiment for clean ones",
+                    expected="an equal number in all arms",
+                    remedy="raise plan.reserve for perturbed episodes, or spare in the experiment for clean ones",
                 )
             render_plan(chosen, run, trajectories, frames, workers)
         _write(kept, EpisodeLoader(folder, run.render), experiment.frame_px, workers, file)
@@ -131,7 +131,7 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
 
 
 def _write(rows: Sequence[plan.Row], load: EpisodeLoader, frame_px: int, workers: Workers, file: Path) -> None:
-    small = workers(partial(_small, load, frame_px), [row.episode_id for row in rows], "frames made small")
+    small = workers(partial(_small, load, frame_px), [row.episode_id for row in rows], "small frames")
     columns: dict[str, Any] = {}
     for name in small[0]:
         columns[name] = np.concatenate([episode[name] for episode in small])
@@ -160,7 +160,7 @@ def read(file: Path) -> Dataset:
         PipelineError: if the file does not exist.
     """
     if not file.is_file():
-        raise PipelineError("the arm has no data yet", where=file, remedy="make it first: the step `data`")
+        raise PipelineError("the arm has no data yet", where=file, remedy="generate the data by the step `data`")
     with np.load(file) as arrays:
         return Dataset(
             {view: arrays[view] for view in VIEWS},

@@ -96,7 +96,7 @@ class Experiment(Frozen):
     def _matches_run(self) -> Experiment:
         planned = self.run.plan.episodes
         if self.run.demos.root is None:
-            raise ValueError(f"{self.data} has no demos.root to make the demonstrations in")
+            raise ValueError(f"{self.data} has no demos.root for the demonstrations")
         for arm, names in self.arms.items():
             unknown = [name for name in names if name not in planned]
             if unknown:
@@ -104,7 +104,9 @@ class Experiment(Frozen):
                 raise ValueError(f"{self.data} plans no episodes of {unknown[0]!r} for {arm}, but of {expected}")
             uneven = [name for name in names if planned[name] % len(self.tasks)]
             if uneven:
-                raise ValueError(f"{planned[uneven[0]]} episodes of {uneven[0]!r} are not as many of each task")
+                raise ValueError(
+                    f"{planned[uneven[0]]} episodes of {uneven[0]!r} cannot be divided equally among the tasks"
+                )
             perturbed = sum(planned[name] for name in names)
             if 3 * perturbed > 2 * self.episodes:
                 raise ValueError(

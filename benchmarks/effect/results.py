@@ -88,10 +88,10 @@ def read(folder: Path) -> list[PolicyResults]:
         for name, made_by in policies[-1].made_by().items():
             if made_by != first[name]:
                 raise PipelineError(
-                    f"made by other {name} than the results beside it",
+                    f"{name} differ from those of the other results in this folder",
                     where=file,
                     expected="one experiment",
-                    remedy="evaluate all policies under the same experiment, or delete those of the older one",
+                    remedy="evaluate all policies under the same experiment, or move the older results away",
                 )
     if not policies:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")

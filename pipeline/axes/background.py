@@ -44,8 +44,8 @@ MATERIALS: dict[Part, dict[str, int]] = {
 }
 """Candidate materials of each part in LIBERO's five arenas (`scenes/*_base_style.xml`); the first shown one is used.
 
-The number says how often a new texture is repeated across the material's own texture. The top of a modelled table is
-only a small piece of its unfolded skin."""
+A new texture is repeated by the given number across the material's own texture. The top of a modelled table is only a
+small piece of its unfolded skin."""
 
 PARTS: dict[Component, tuple[Part, ...]] = {"theme": ("wall", "floor", "cupboard", "surface"), "surface": ("surface",)}
 """Parts that a perturbation names a texture for. Every theme test of LIBERO-Plus names one for a wall and one for the
@@ -90,7 +90,7 @@ class BackgroundPerturbation(RenderPerturbation):
     colour_scale: Share
 
     fields: ClassVar[tuple[str, ...]] = ("tex_data",)
-    measure: ClassVar[str] = "0 where an image's name or bytes are those of a test task's, else 1"
+    measure: ClassVar[str] = "0 if a test task shows an image of the same name or bytes, else 1"
     clearance: ClassVar[float] = 1.0
 
     def apply(self, model: mujoco.MjModel) -> None:

@@ -92,7 +92,7 @@ class Perturbation(Frozen):
 
     layer: ClassVar[Layer]
     views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
-    measure: ClassVar[str] = "nothing to compare with: the benchmark has no such test"
+    measure: ClassVar[str] = "undefined, because the benchmark has no such test"
     unit: ClassVar[str | None] = None
     clearance: ClassVar[float] = 0.0
     same: ClassVar[Same | None] = None
@@ -334,7 +334,7 @@ LIGHT_FIELDS = (
 FIELDS = (*CAMERA_FIELDS, *OPACITY_FIELDS, *LIGHT_FIELDS, "tex_data")
 """Arrays of MuJoCo's model that the render layer can change; the tests compare each with MuJoCo's own rendering.
 
-The geometry of a scene, such as ``geom_size`` or ``mesh_vert``, is kept from one picture to the next."""
+The geometry of a scene, such as ``geom_size`` or ``mesh_vert``, is kept from one frame to the next."""
 
 
 class RenderPerturbation(Perturbation):
@@ -345,7 +345,7 @@ class RenderPerturbation(Perturbation):
         paints: true if it writes textures and nothing else.
         sees_otherwise: true if it shows other surfaces: from another place, through another lens, or behind a
             surface that was opaque.
-        casts_shadows: true if lamps may cast shadows that LIBERO's own do not, which take longer to render.
+        casts_shadows: true if lamps may cast shadows that LIBERO's own lamps do not cast; they take longer to render.
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
@@ -360,8 +360,8 @@ class RenderPerturbation(Perturbation):
         unsupported = {*cls.fields} - {*FIELDS}
         if unsupported:
             raise TypeError(
-                f"{cls.__name__} writes {sorted(unsupported)}, which pictures would not follow: make it a "
-                "PhysicsPerturbation, which changes the scene before it is replayed"
+                f"{cls.__name__} writes {sorted(unsupported)}, which frames would not show: derive it from "
+                "PhysicsPerturbation, which changes the scene before the replay"
             )
         cls.casts_shadows = "light_castshadow" in cls.fields
         cls.paints = cls.fields == ("tex_data",)

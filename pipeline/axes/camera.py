@@ -199,7 +199,7 @@ class DistanceRange(Frozen):
 
 
 class SphericalRange(Frozen):
-    """The test set's azimuths are whole degrees in [-75, 75], its elevations 0 and 15. The level is the azimuth's."""
+    """The test set's azimuths are whole degrees in [-75, 75], its elevations 0 and 15. The azimuth sets the level."""
 
     azimuth_deg: ByLevel[Angles] = (
         ((-15.0, 15.0),),
@@ -231,7 +231,7 @@ Aside = Literal["elevation", "distance", "turn", "yaw"]
 
 
 class AsideRange(Frozen):
-    """Second change of a camera, just larger than the clearance, that keeps a perturbation clear of the test cameras.
+    """Second change of a camera, slightly larger than the clearance, that separates it from the test cameras.
 
     A test camera changes its distance, its place on the sphere or its turn in place, and leaves the other two alone.
 
@@ -286,10 +286,11 @@ TRIED_CAMERAS = 300
 
 
 class CameraAxis(Axis):
-    """The ranges to draw from: each component spans what LIBERO-Plus's test cameras of its kind do.
+    """Ranges to sample from: each component spans the values of LIBERO-Plus's test cameras of its kind.
 
-    There every value is taken, so a draw changes something else as well, which keeps it 5 degrees from all of them:
-    a distance of 1.6 with 6 degrees of elevation is clear. Frames of the defaults were looked at in all five arenas.
+    Test cameras use every value of these ranges. A perturbation therefore has a second change, which keeps it 5 degrees
+    from all test cameras: a distance of 1.6 with 6 degrees of elevation has its clearance. Frames of the defaults were
+    inspected in all five arenas.
 
     Attributes:
         components: which of them, each as often as the others.
@@ -327,7 +328,7 @@ class CameraAxis(Axis):
             return raw  # The field's own type reports this.
         left = [name for name in components if name not in null]
         if not left:
-            raise ValueError("leave at least one of distance, spherical and orientation")
+            raise ValueError("keep at least one of distance, spherical and orientation")
         return {name: ranges for name, ranges in raw.items() if name not in null} | {"components": left}
 
     @classmethod
@@ -363,8 +364,8 @@ class CameraAxis(Axis):
                     f"{CameraPerturbation.clearance:g} degrees from all test cameras",
                     where="plan.axes.camera",
                     expected="components that can change together with it, with ranges that reach 5 degrees",
-                    remedy="name more components or wider ranges; or clear_by: off, which lets training cameras equal "
-                    "test cameras",
+                    remedy="add components or widen the ranges; or set clear_by: off, so that training cameras may "
+                    "equal test cameras",
                 )
 
     def _has_clear(self, component: Component, level: Level, test: TestSet, task: Task) -> bool:
@@ -390,7 +391,7 @@ class CameraAxis(Axis):
     def _draw_second_change(self, rng: np.random.Generator, component: Component) -> dict[str, float]:
         """Sample a second change within the configured ranges; empty if none is found.
 
-        A camera without one is rarely clear, and then sampled again.
+        A camera without a second change rarely keeps its clearance, and is then sampled again.
         """
         kinds = [kind for kind in ASIDES[component] if COMPONENT_OF[kind] in self.components]
         if not kinds:

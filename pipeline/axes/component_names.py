@@ -15,7 +15,7 @@ _CURRENT = {former: name for name, former in FORMER.items()}
 
 
 def current_names(joined: Any) -> Any:
-    """Replace former names in the name of a component, or in several that are joined by +; return no text as it is."""
+    """Replace former names in the name of a component, or in names joined by +; return other values unchanged."""
     if not isinstance(joined, str):
         return joined
     return "+".join(_CURRENT.get(name, name) for name in joined.split("+"))

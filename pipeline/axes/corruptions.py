@@ -37,7 +37,7 @@ def _gaussian_blur(image: Floats, sigma_px: float) -> Floats:
 
 
 class Motion(Frozen):
-    """Blur by a one-sided Gaussian trail in a direction drawn from +-45 degrees; ImageMagick's MotionBlurImage.
+    """Blur by a one-sided Gaussian trail in a direction sampled from +-45 degrees; ImageMagick's MotionBlurImage.
 
     ``out(p) = sum_i w_i in(p + round(i u))`` for i = 0 .. 2 ``radius_px``, w_i ~ exp(-i^2 / 2 sigma^2), u the unit
     vector (cos, sin) of the angle in (x right, y down), halves rounded down, edges repeated.
@@ -191,7 +191,7 @@ def _scatter(frame: Frame, offsets: NDArray[np.int8], delta_px: int) -> None:
 class Glass(Frozen):
     """Frosted glass: blur, scatter pixels by -delta .. delta - 1 in each direction, blur again.
 
-    ImageNet-C means to swap pixels, but its assignment between NumPy views copies one over the other; so does this.
+    ImageNet-C intends to swap pixels, but its assignment between NumPy views copies one over the other, as here.
     """
 
     component: ClassVar[Component] = "glass"

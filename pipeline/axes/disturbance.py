@@ -33,7 +33,7 @@ Duration = Annotated[int, Field(ge=1, le=100)]
 
 
 class DisturbancePerturbation(PhysicsPerturbation):
-    """A force on the hand that begins with a control step and ends after some, whatever the policy does.
+    """A force on the hand from a given control step for a given number of steps, independent of the policy.
 
     Attributes:
         body: body of MuJoCo's model on whose centre of mass the force acts.

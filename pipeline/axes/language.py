@@ -75,7 +75,7 @@ class LanguagePerturbation(TextPerturbation):
 
 
 class LanguageAxis(Axis):
-    """Draws rewrites from the bank: all those of the chosen levels, none more often than another.
+    """Rewrites from the bank: all rewrites of the chosen levels, each equally often.
 
     Attributes:
         components: the classes drawn from.
@@ -86,7 +86,7 @@ class LanguageAxis(Axis):
     colour: ClassVar = "#e4572e"
     dimension: ClassVar = "language"
     audited: ClassVar = "instructions"
-    not_held_out: ClassVar[str] = "its rewrites are a list, and plans train on all of it"
+    not_held_out: ClassVar[str] = "its rewrites are a fixed list, and plans use the whole list"
 
     former_fields: ClassVar[Mapping[str, str]] = {"classes": "components"}
 
@@ -103,7 +103,7 @@ class LanguageAxis(Axis):
         """
         components = self._components_beside(axes)
         if not components:
-            raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.components")
+            raise ValueError(f"if objects are added, axes.language.components must contain {' or '.join(NAMED)}")
         return self.model_copy(update={"components": components})
 
     def _components_beside(self, axes: Collection[str]) -> tuple[Component, ...]:
@@ -128,7 +128,7 @@ class LanguageAxis(Axis):
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
         """Return the rewrite at ``place`` of the task's list, which starts again at its end.
 
-        The caller deals out the places, because independent random choices would repeat. ``rng`` is not used.
+        The caller assigns the places, because independent random choices would repeat. ``rng`` is not used.
 
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
@@ -197,10 +197,10 @@ def read_bank(file: Path) -> Bank:
         return TypeAdapter(Bank).validate_python(content)
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         raise PipelineError(
-            f"not a bank of rewrites ({error})",
+            f"the file is not a bank of rewrites ({error})",
             where=file,
             expected=f"ASCII YAML: suite, task name, class ({', '.join(CLASSES)}), list of sentences",
-            remedy="correct or restore the file, or make it again with the command rewrite",
+            remedy="correct or restore the file, or generate it again with the command rewrite",
         ) from error
 
 
@@ -210,7 +210,7 @@ def deal(
     levels: tuple[Level, ...] = get_args(Level),
     bank: Path | None = None,
 ) -> tuple[LanguagePerturbation, ...]:
-    """List all rewrites of a task in the order in which they are dealt: shuffled by task, the classes taking turns.
+    """List all rewrites of a task in the order in which plans use them: shuffled by task, with the classes in turn.
 
     Raises:
         PipelineError: when there are none, or one of them does not pass ``lint``.
@@ -222,7 +222,7 @@ def deal(
         f"task {task} has no rewrites of class {' or '.join(classes)} at level {' or '.join(map(str, levels))}",
         where=bank or BANK_FILE,
         expected=f"a task of {', '.join(load_bank())}",
-        remedy="add rewrites of the task to the bank, or take language out of the configured axes",
+        remedy="add rewrites of the task to the bank, or remove language from the configured axes",
     )
 
 
@@ -245,7 +245,7 @@ def _dealt(
         fault = lint(rewrite.text, task, rewrite.component)
         if fault:
             raise PipelineError(
-                f"{rewrite.component} rewrite {rewrite.text!r} of {task} is refused: {fault}",
+                f"{rewrite.component} rewrite {rewrite.text!r} of {task} is rejected: {fault}",
                 where=bank or BANK_FILE,
                 expected=f"lower-case ASCII, {LENGTH}, no final punctuation, the task's goal",
                 remedy=REMEDY,

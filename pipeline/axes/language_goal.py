@@ -6,9 +6,9 @@ The goal comes from the BDDL file, its words from ``language_words.yaml``. No gr
 * The words right before a place give the relation to it.
 * If two things go to different places, the first thing goes to the first place.
 
-A rewrite need not say what LIBERO's own wording does not say by these words. The check finds a missing goal, for named
-and for described things. ``language_extra.py`` finds a second goal. Neither finds the opposite ("do not"), nor
-descriptions that fit several things: writers check these.
+A rewrite may leave out a part of the goal that LIBERO's own wording does not express by these words. The check finds a
+missing goal, for named and for described things. ``language_extra.py`` finds a second goal. Neither finds the opposite
+("do not"), nor descriptions that fit several things: writers check these.
 """
 
 import re
@@ -340,9 +340,9 @@ def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
     parts = [aim.part for aim in located] + [change.part for change in goal.changes]
     parts += _sides(goal, original)
     for part in dict.fromkeys(part for part in parts if part):
-        yield Demand(f"does not say which, {part}", partial(Reading.tells_part, part=part))
+        yield Demand(f"does not identify the part {part!r}", partial(Reading.tells_part, part=part))
     for kind in goal.pairs:
-        yield Demand(f"does not say both {_name(kind)}s", partial(Reading.has, patterns=words().both))
+        yield Demand(f"does not name both {_name(kind)}s", partial(Reading.has, patterns=words().both))
     for aim in located:
         if aim.relation and aim.place:
             yield Demand(
@@ -355,7 +355,7 @@ def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
                 yield Demand(_on_shelf(top), partial(Reading.tells_top, top=top))
     states = {change.state for change in goal.changes} | {*words().states} & {*original.plain.split()}
     for state in sorted(states):
-        yield Demand(f"does not say to {state}", partial(Reading.tells_state, state=state))
+        yield Demand(f"does not ask to {state}", partial(Reading.tells_state, state=state))
     destinations = {aim._replace(thing="") for aim in goal.aims}
     if len(moved) > 1 and len(destinations) > 1:
         yield Demand("lets the things change places", partial(Reading.in_order, aims=goal.aims))
@@ -370,7 +370,7 @@ def _sides(goal: TaskGoal, original: Reading) -> list[str]:
 
 def _on_shelf(top: bool) -> str:
     """Return the fault of a rewrite that does not keep a shelf's top, or its inside if ``top`` is false."""
-    return "does not say on top of the shelf" if top else "says on top of the shelf, which is another place"
+    return "has no words for the top of the shelf" if top else "names the top of the shelf, which is another place"
 
 
 def _relation(aim: Aim, goal: TaskGoal, original: Reading) -> Callable[[Reading], bool]:

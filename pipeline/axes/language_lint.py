@@ -29,7 +29,7 @@ LENGTH = (
     f"at least {MIN_WORDS} words, at most {MAX_WORDS_AND_MARKS} words and punctuation marks together, "
     f"and at most {MAX_CHARACTERS} characters"
 )
-REMEDY = "correct or delete the sentence; or, where it is right, add its words to axes/language_words.yaml"
+REMEDY = "correct or delete the sentence; or, if it is correct, add its words to axes/language_words.yaml"
 
 _PREAMBLE = re.compile(
     r"^(sure|certainly|of course)\b\W*here\b"
@@ -73,7 +73,7 @@ def lint(text: str, task: Task, component: Component) -> str | None:
     if debris(text):
         return "file-name debris"
     if not _WELL_FORMED.fullmatch(text):
-        return "characters, spacing or punctuation other than of a lower-case sentence without its final full stop"
+        return "characters, spacing or punctuation that a lower-case sentence without its final full stop does not have"
     if words < MIN_WORDS:
         return f"{words} words, wanted {LENGTH}"
     if words_and_marks > MAX_WORDS_AND_MARKS:

@@ -1,4 +1,4 @@
-"""Layout, confounding objects: things that the task does not need stand on the working surface. Physics layer."""
+"""Layout, confounding objects: objects on the working surface that the task does not need. Physics layer."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class LayoutPerturbation(PhysicsPerturbation):
     objects: Annotated[tuple[AddedObject, ...], Field(min_length=1)]
     seed: int
 
-    measure: ClassVar[str] = "infinite where no category is shared with a test task in the same scene, else 0"
+    measure: ClassVar[str] = "infinite if no category is shared with a test task in the same scene, else 0"
     clearance: ClassVar[float] = 1.0
     can_hide: ClassVar[bool] = True
 
@@ -118,10 +118,10 @@ class LayoutPerturbation(PhysicsPerturbation):
 class LayoutAxis(Axis):
     """Number and sources of added objects.
 
-    The level is the number of objects, 1 to 5 as in LIBERO-Plus. An object is never of a category that is in the scene
-    already or that the instruction names, nor of one that the test set adds. The same model may come twice, but two
-    models of one category never do. A scene's objects are sampled with replacement from ``SHELF`` models of different
-    categories. LIBERO-Plus repeats its 13 models as often: in 6, 21, 42 and 60 % of its scenes with 2, 3, 4 and 5.
+    The level is the number of objects, 1 to 5 as in LIBERO-Plus. No object has a category that is in the scene already,
+    that the instruction names, or that the test set adds. A scene may repeat a model, but never has two models of one
+    category. A scene's objects are sampled with replacement from ``SHELF`` models of different categories. LIBERO-Plus
+    repeats its 13 models as often: in 6, 21, 42 and 60 % of its scenes with 2, 3, 4 and 5 objects.
 
     Attributes:
         sources: ``libero`` and ``robosuite`` are installed; ``sweethome3d`` (fetched by apt-get, 120 MB) and folders of
@@ -154,9 +154,9 @@ class LayoutAxis(Axis):
                 shelf.setdefault(model.category, model)
         if len(shelf) < level:
             raise PipelineError(
-                f"{len(shelf)} categories of objects go with {task}, {level} are wanted",
+                f"{len(shelf)} categories of objects can be added to {task}, but {level} are needed",
                 where="plan.axes.layout",
-                remedy="add sources, widen area_m2 or leave out the higher levels",
+                remedy="add sources, increase area_m2, or leave out the higher levels",
             )
         choice = list(shelf.values())
         objects = tuple(AddedObject.of(choice[index]) for index in rng.integers(len(choice), size=level))

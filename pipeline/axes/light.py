@@ -95,7 +95,7 @@ class LightPerturbation(RenderPerturbation):
         model.light_specular *= self.specular_scale
         if self.tilt_deg:
             azimuth = np.deg2rad(self.tilt_azimuth_deg)
-            # A turn about this axis takes a direction that points down towards the azimuth.
+            # A rotation about this axis turns a direction that points down towards the azimuth.
             across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
             model.light_dir[:] = model.light_dir @ _rotation(across, self.tilt_deg).T
         if self.shadows:
@@ -104,7 +104,7 @@ class LightPerturbation(RenderPerturbation):
             _limit(model.light_specular, model.light_directional, SHADOWED_SPECULAR)
             model.light_diffuse *= 1 - self.fill_scale
             # In MuJoCo a lamp's ambient light stops at shadows, the emission of a surface does not. The emission is a
-            # third of the light taken from the lamps: with more, walls outshine the table, with less, all darkens.
+            # third of the light taken from the lamps. With more, walls outshine the table; with less, it is dark.
             model.mat_emission += self.fill_scale * SHADOWED_DIFFUSE / 3
         if self.specular_scale > 1:
             # A surface does not scatter the light of its highlights. The root maps scales 2 to 30 to 0.9 to 0.6.
@@ -142,10 +142,10 @@ def _range(dim: tuple[float, float], bright: tuple[float, float], *others: tuple
 
 
 class LightAxis(Axis):
-    """The ranges to draw from, chosen by looking at all arenas: from just noticeable to as far as all still shows.
+    """Ranges to sample from, chosen by eye in all arenas: from barely noticeable to the limit of full visibility.
 
-    Noticeable: of the agent view's pixels, 5 % differ by 8 grey levels or more. This holds at levels 1 and 5 of every
-    component in every arena, for twelve samples each (see docs/axes.md).
+    Noticeable means that 5 % of the agent view's pixels differ by 8 grey levels or more. This holds at levels 1 and 5
+    of every component in every arena, for twelve samples each (see docs/axes.md).
 
     Attributes:
         components: which of them. ``shadows`` turns the lamps, too. ``combined`` changes diffuse light, direction and

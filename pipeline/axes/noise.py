@@ -195,7 +195,7 @@ class NoiseAxis(Axis):
                 name, _ = grid[0].strength
                 tested = ", ".join(f"{value:g}" for value in _tested(test, component, name)[0])
                 raise PipelineError(
-                    f"{component} has test tasks as strong as the level {', '.join(map(str, near))}",
+                    f"{component} has test tasks as strong as level {', '.join(map(str, near))}",
                     where=f"plan.axes.noise.{component}",
                     expected=f"{name} at least a quarter of the way from each of {tested}",
                     remedy="change these rows, or leave these levels out of plan.axes.noise.levels",

@@ -337,7 +337,7 @@ def _disk_m(task: Task) -> float:
 
 
 def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
-    """Check that things at ``xy_m`` (2,), in the frame of their surface, keep the task's relations and their distance.
+    """Return whether things at ``xy_m`` (2,), in the frame of their surface, keep the task's relations and distances.
 
     The objects that the task needs must also be within the hand's reach.
     """
@@ -367,8 +367,8 @@ def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
 class PoseAxis(Axis):
     """Displacements in all directions with equal probability.
 
-    The component ``scene`` moves everything at once, as LIBERO-Plus does: see ``sample_scene``. The others move and
-    turn one object, sampled from those that the task has.
+    The component ``scene`` moves everything at once, as LIBERO-Plus does: see ``sample_scene``. The other components
+    move and turn one object, sampled from the objects of the task that they can move.
 
     Attributes:
         components: moved parts of the scene.

@@ -144,7 +144,7 @@ def benchmark_offsets_rad() -> Floats:
 
 
 def measure_start(start: Look, twin: Look, component: str, level: int) -> Iterator[tuple[str, float]]:
-    """Measure how far the hand is moved and turned at the first look of an episode, next to its clean twin's."""
+    """Measure how far the hand is moved and turned in an episode's first observation, relative to its clean twin."""
     yield f"hand moved by {component}, level {level} (cm)", start.moved_cm(twin)
     yield f"hand turned by {component}, level {level} (degrees)", start.turned_deg(twin)
 

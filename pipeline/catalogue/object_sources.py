@@ -35,8 +35,8 @@ Source = Package | Folder
 
 FOLDER = Path("data/objects")
 """Folder of converted models, one folder each: ``<source>/<name>/model.xml`` and ``about.json``."""
-AGAIN = "`python -m pipeline sources CONFIG`, which converts what is not there"
-"""Words for error messages: the command that converts a missing model again."""
+AGAIN = "`python -m pipeline sources CONFIG`, which converts missing models"
+"""Command that converts a missing model again, for error messages."""
 CATALOGUE = Path(__file__).with_name("objects.yaml")
 
 LARGEST_M = 0.5
@@ -125,7 +125,9 @@ def _sweethome3d() -> Iterator[ObjectModel]:
                     convert(piece.unpack(Path(scratch)), folder, piece.size_m, piece.turn)
             absent = missing()
             if absent:
-                raise PipelineError(f"the package lacks {', '.join(sorted(absent))}", where=deb, remedy="report it")
+                raise PipelineError(
+                    f"the package lacks {', '.join(sorted(absent))}", where=deb, remedy="report this error"
+                )
     for name in names.values():
         yield converted(name)
 
@@ -136,7 +138,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
     paths = sorted(path for path in models if not path.name.startswith("."))
     if not paths:
         raise PipelineError(
-            "there are no models here",
+            "the folder has no models",
             where=source.folder,
             expected="<category>/<name>.obj or <category>/<name>.xml",
             remedy="correct the folder in plan.axes.layout.sources",
@@ -145,9 +147,9 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         category = path.parent.name
         if not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)*", category):
             raise PipelineError(
-                f"{category!r} is no category",
+                f"{category!r} is not a category",
                 where=path.parent,
-                expected="what an instruction would call the objects, in small letters, such as bottle_of_milk",
+                expected="the noun of an instruction for the objects, in lower case, such as bottle_of_milk",
                 remedy="rename the folder",
             )
         made_from = digest("object", RECIPE, path.name, _hashed_files(path.parent))
@@ -189,7 +191,7 @@ def _check_size(mjcf: Path, path: Path) -> None:
             f"the model measures {longest:.3g} m",
             where=path,
             expected=f"at most {LARGEST_M} m in any direction",
-            remedy="scale it to metres, or leave it out",
+            remedy="scale the model to metres, or move it out of the folder",
         )
 
 
@@ -210,7 +212,9 @@ def _copy(mjcf: Path, out: Path) -> None:
             asset.set("file", f"{number}{file.suffix}")
             shutil.copyfile(file, out / asset.attrib["file"])
     except (OSError, ET.ParseError) as error:
-        raise PipelineError(f"cannot be copied ({error})", where=mjcf, expected="MJCF with its files") from error
+        raise PipelineError(
+            f"the model cannot be copied ({error})", where=mjcf, expected="MJCF with its files"
+        ) from error
     tree.write(out / "model.xml")
 
 

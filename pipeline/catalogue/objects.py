@@ -43,7 +43,7 @@ def models(sources: tuple[Source, ...]) -> dict[str, ObjectModel]:
             raise PipelineError(
                 f"{model.name} is of the category {model.category}, which the test set adds to its scenes",
                 where=model.mjcf,
-                remedy="leave it out",
+                remedy="leave the object out of its source",
             )
     return {model.name: model for model in sorted(members, key=lambda model: model.name)}
 
@@ -60,7 +60,7 @@ def find(name: str, sha256: str) -> ObjectModel:
     model = installed or converted(name)
     if model.sha256 != sha256:
         raise PipelineError(
-            f"the object {name} is not the one that was planned with",
+            f"the object {name} differs from the planned object",
             where=model.mjcf,
             remedy="rm -rf .venv && bash setup.sh" if installed else f"move its folder away and run {AGAIN}",
         )

@@ -82,10 +82,10 @@ def _found(name: str, where: object) -> str:
     file = object_sources.FOLDER.resolve() / below
     if not file.is_file() or checksum(file) != sha256:
         raise PipelineError(
-            f"the scene has an added object whose file {below} is {'another' if file.is_file() else 'not there'}",
+            f"the file {below} of an added object {'has changed' if file.is_file() else 'is missing'}",
             where=where,
             expected=f"{file} with the SHA-256 {sha256}",
-            remedy=f"copy {object_sources.FOLDER} from where the trajectory was made, or move the object's folder away "
-            f"and run {object_sources.AGAIN}",
+            remedy=f"copy {object_sources.FOLDER} from the machine that generated the trajectory, or move the object's "
+            f"folder away and run {object_sources.AGAIN}",
         )
     return str(file)

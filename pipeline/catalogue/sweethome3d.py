@@ -60,11 +60,11 @@ def fetch(folder: Path) -> Path:
     """Fetch the package's file into ``folder`` unless it exists, by apt from the machine's own mirror.
 
     Raises:
-        PipelineError: when the file cannot be downloaded, or is not the package that the catalogue was written for.
+        PipelineError: when the file cannot be downloaded, or is not the package that the catalogue describes.
     """
     remedy = (
-        f"`sudo apt-get update`, and run it again; or put {DEB} of Debian 12 there; or leave sweethome3d out of "
-        "plan.axes.layout.sources: libero, robosuite and a folder work without it"
+        f"run `sudo apt-get update`, then the command again; or put {DEB} of Debian 12 into {folder}; or leave "
+        "sweethome3d out of plan.axes.layout.sources: libero, robosuite and a folder do not need it"
     )
     command = ["apt-get", "download", f"{PACKAGE}={VERSION}"]
     return fetched(folder / DEB, SHA256, command, f"Debian's {PACKAGE} {VERSION} (120 MB)", remedy)

@@ -60,7 +60,7 @@ _LICENCES = {
 LARGEST_PX = 64_000_000
 """Largest number of pixels of an image: 8,000 pixels square."""
 
-REPLACE = "replace it or take it away"
+REPLACE = "replace the file, or move it away"
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 
@@ -106,7 +106,7 @@ def offered(source: Source) -> Iterator[Texture]:
             files = _images(source.folder)
             if not files:
                 raise PipelineError(
-                    "there are no images here",
+                    "the folder has no images",
                     where=source.folder,
                     expected="PNG or JPEG files",
                     remedy="correct the folder in plan.axes.background.sources",
@@ -146,7 +146,7 @@ def from_file(name: str, file: Path, licence: str) -> Texture:
     try:
         sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
-        raise PipelineError(f"cannot read the texture ({error})", where=file, remedy="put it back") from error
+        raise PipelineError(f"cannot read the texture ({error})", where=file, remedy="put the file back") from error
     return Texture(name, name.partition(":")[0], licence, sha256, lambda: _decode(file.read_bytes(), file))
 
 
@@ -167,9 +167,10 @@ def kept(name: str, sha256: str) -> Texture:
     texture = from_file(name, file, "the folder's") if file.is_file() else None
     if texture is None or texture.sha256 != sha256:
         raise PipelineError(
-            f"the texture {name} is {'missing' if texture is None else 'damaged: move its file away'}",
+            f"the texture {name} is {'missing' if texture is None else 'damaged'}",
             where=file,
-            remedy=f"copy {FOLDER} from where the plan was made, or python stages/plan.py CONFIG",
+            remedy=f"{'' if texture is None else 'move the file away, then '}copy {FOLDER} from the machine that "
+            "planned the run, or run python stages/plan.py CONFIG",
         )
     return texture
 
@@ -203,7 +204,7 @@ def _decode(content: bytes, where: object) -> Frame:
             raise ValueError(f"{width_px} x {height_px} pixels, at most {LARGEST_PX} are read")
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR_RGB)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, cv2.error) as error:
-        raise PipelineError(f"not a readable image ({error})", where=where, remedy=REPLACE) from error
+        raise PipelineError(f"the file is not a readable image ({error})", where=where, remedy=REPLACE) from error
     if image is None:
-        raise PipelineError("not a readable image", where=where, remedy=REPLACE)
+        raise PipelineError("the file is not a readable image", where=where, remedy=REPLACE)
     return np.asarray(image, np.uint8)

@@ -78,7 +78,7 @@ def refusal(name: str, sha256: str) -> str | None:
     if normalise(name) in {normalise(used) for used in IN_TEST_SET}:
         return "it has the name of an image that test tasks show"
     if _DATA_MAP.search(re.split(r"[/\\:]", name)[-1]):
-        return "by its name it is not a colour map"
+        return "its name is that of a data map, not of a colour map"
     return None
 
 

@@ -153,7 +153,7 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
     """
     stored = statistics.get(folder.parent.name)
     if stored is None:
-        return {"violations": ["dataset_statistics.json has nothing on it"]}
+        return {"violations": ["dataset_statistics.json lacks this dataset"]}
     violations: list[str] = []
     motions: list[exact_statistics.Motion] = []
     samples: list[int] = []
@@ -170,13 +170,16 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
             samples.append(len(trained))
             clipped += int((np.abs(trained.actions[:, 0, :6]) == 1).sum())
     if not samples:
-        return {"episodes": episodes, "violations": [*violations, "holds nothing to train on: OFT waits for ever"]}
+        return {
+            "episodes": episodes,
+            "violations": [*violations, "has no episode to train on, so OFT would wait for ever"],
+        }
     if _closes_on_open(motions):
-        violations.append("fingers part where the gripper is told to close: the command's sign is wrong")
+        violations.append("fingers open after a command to close: the command's sign is wrong")
     measured = exact_statistics.openvla(motions)
     difference = _difference(measured, stored)
     if not difference <= SAME:
-        violations.append(f"dataset_statistics.json is off by up to {difference:g}")
+        violations.append(f"dataset_statistics.json differs from the data by up to {difference:g}")
     return {
         "episodes": episodes,
         "steps": measured["num_transitions"],

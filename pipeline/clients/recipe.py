@@ -74,7 +74,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
         often = "about equally often, as the steps of val count too" if validating else "equally often"
         dataset["mixtures"] = sourced(
             {rlds.name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
-            f"OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn {often}",
+            f"OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is sampled {often}",
         )
         # OFT requests the validation split from every dataset.
         oft_validates = bool(validating) and validating == {*suites.values()}

@@ -59,6 +59,6 @@ def refuse_other_actions(params: Mapping[str, Any], spec: Mapping[str, Mapping[s
             f"the server's actions cannot be executed: it announces {', '.join(unsupported)}",
             where=server,
             expected="deltas of position and axis-angle, and a gripper that opens below 0 and else closes",
-            remedy="GR00T's server has --args.invert_gripper for the gripper. Absolute actions, such as X-VLA's with "
-            "--args.benchmark_profile libero, are executed by vla-eval's own LIBERO benchmark alone",
+            remedy="start GR00T's server with --args.invert_gripper; evaluate absolute actions, such as X-VLA's with "
+            "--args.benchmark_profile libero, by vla-eval's own LIBERO benchmark",
         )

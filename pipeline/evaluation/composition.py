@@ -150,8 +150,8 @@ def pairs(results: Iterable[Stored]) -> list[Pair]:
             counted.append(pair)
     if not counted:
         raise PipelineError(
-            "no trial has all four combinations of two axes, the pair with the draws of its singles",
-            remedy="python -m pipeline evaluate DIR --server URL --source pairs",
+            "no trial has all four combinations of two axes with equal perturbations in the pair and its single axes",
+            remedy="run `python -m pipeline evaluate DIR --server URL --source pairs`",
         )
     return counted
 

@@ -152,7 +152,7 @@ class EpisodeEnvironment:
         """
         given, *others = checked_actions(action, "action").copy()
         if others:
-            raise PipelineError("several actions", expected="one action, (7,)")
+            raise PipelineError("step got several actions", expected="one action, (7,)")
         if self.progress.over:
             raise PipelineError("no episode is running", expected="reset before step, and no step after its end")
         given[6] = -1.0 if given[6] < 0 else 1.0
@@ -288,7 +288,7 @@ class EpisodeEnvironment:
         assets = libero_plus.assets_of(test, self._archive)
         if assets is None:
             raise PipelineError(
-                f"changes the {test.axis}, for which the asset archive of LIBERO-Plus is needed",
+                f"the task changes the {test.axis}, which needs the asset archive of LIBERO-Plus",
                 where=str(self.task),
                 expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}" if self._archive is None else None,
                 remedy="name the unpacked archive: --assets DIR",

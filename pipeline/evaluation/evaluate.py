@@ -63,7 +63,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     settings, policy = evaluation.settings, evaluation.policy
     if settings.look_every != 1 and policy.kind != "server":
         raise PipelineError(
-            f"only a server is shown one observation in {settings.look_every}", where="look_every", expected="--server"
+            f"only a server can observe every {settings.look_every} steps", where="look_every", expected="--server"
         )
     selected = select(selection, evaluation.archive)
     check_settings(selection, selected, settings)
@@ -82,7 +82,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     results = {task: evaluation.result(task) for task in selected}
     rows = [row for row in results.values() if row is not None]
     without_result = [task for task, row in results.items() if row is None]
-    changed = "the plan or the archive changed while it ran"
+    changed = "the plan or the archive changed during the evaluation"
     faults |= {task: changed for task in without_result if task not in faults}
     summarised = summary(rows) | {
         "policy": {"name": policy.name(evaluation.identity), "identity": evaluation.identity},
@@ -142,7 +142,7 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
         )
     if settings.step_limits == "lerobot" and not any(task.suite == "libero_spatial" for task in wanted):
         raise PipelineError(
-            "lerobot's limits differ in libero_spatial alone, and no task is of it",
+            "lerobot's step limits differ only in libero_spatial, and no task of this suite is selected",
             where="step_limits",
             expected="openvla",
         )
@@ -150,7 +150,7 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
         unsupported = {task.source for task in wanted} & {"libero_plus", "goals"}
         if unsupported:
             raise PipelineError(
-                f"tasks of {' and '.join(sorted(unsupported))} never start where a demonstration does",
+                f"tasks of {' and '.join(sorted(unsupported))} do not start in the first state of a demonstration",
                 where="initial_states",
                 expected="tasks of libero and own",
                 remedy="leave --initial-states out",
@@ -160,10 +160,10 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
         if repeated:
             name = repeated[0]
             raise PipelineError(
-                f"{starts[name]} episodes of {name} would be the same: there is one demonstration of it",
+                f"{starts[name]} episodes of {name} would be equal, because it has one demonstration",
                 where="initial_states",
                 expected="one episode of each task of libero",
-                remedy="--episodes 1, or leave --initial-states out",
+                remedy="set --episodes 1, or leave --initial-states out",
             )
 
 
@@ -291,5 +291,5 @@ def _without_result(faults: Sequence[tuple[EvaluationTask, str]]) -> PipelineErr
     more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
     return PipelineError(
         f"{len(faults)} episodes have no result: {'; '.join([*named, *more])}",
-        remedy="mend the policy and run the same command again: finished episodes are kept",
+        remedy="correct the policy and run the same command again: finished episodes are kept",
     )

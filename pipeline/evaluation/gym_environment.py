@@ -72,7 +72,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         self._tasks, self._next, self._stride, self._size_px = tasks, first, stride, size_px
         self._round = 0
         self._evaluation, self._environment = evaluation, EpisodeEnvironment(settings, archive)
-        self._max_episode_steps = settings.step_limit(tasks[0].suite)  # asked for by lerobot
+        self._max_episode_steps = settings.step_limit(tasks[0].suite)  # required by lerobot
         self.observation_space = observation_space(size_px)
         self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float32)
 
@@ -98,10 +98,10 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         count = len(self._tasks)
         if self._round * self._stride >= count:
             raise PipelineError(
-                f"more episodes are asked for than the {count} that were selected",
+                f"lerobot requests more episodes than the {count} selected ones",
                 where="eval.n_episodes",
                 expected=f"--eval.n_episodes={count}",
-                remedy="rows of finished episodes are kept",
+                remedy="set this option; rows of finished episodes are kept",
             )
         self._round += 1
         self._again = self._next >= len(self._tasks)

@@ -96,7 +96,11 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             policy = PolicyConfig(kind="server", address="of the harness", label=label)
             self._evaluation = Evaluation(episodes, policy, policy.identity(), Path(out), archive=self._archive)
         elif label:
-            raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR next to it")
+            raise PipelineError(
+                f"there is no folder for the rows of {label!r}",
+                where="label",
+                remedy="set out: DIR in addition to label",
+            )
         self._next_look = NextLook(self._environment.settings.look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
@@ -149,7 +153,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
                 f"the harness ended this episode after {progress.steps} of {self._environment.step_limit} steps",
                 where="max_steps",
                 expected="episodes that end at the limit of their suite, where their results are written",
-                remedy="leave max_steps out, or out and label",
+                remedy="leave out max_steps, or leave out both out and label",
             )
         self._save()
         return {"success": progress.success, "reason": progress.reason}

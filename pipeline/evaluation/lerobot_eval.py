@@ -27,7 +27,7 @@ try:
     from lerobot.envs.utils import freeze_after_episode_end
 except ImportError as error:
     raise ImportError(
-        "lerobot here takes no environments from outside: use lerobot 0.6.1 and Python 3.12 or 3.13, or "
+        "this lerobot accepts no external environments: use lerobot 0.6.1 with Python 3.12 or 3.13, or "
         "`python -m pipeline evaluate OUT --checkpoint DIR`"
     ) from error
 
@@ -89,10 +89,10 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
             raise PipelineError(f"no source {self.source!r}", where="env.source", expected="libero, libero_plus, goals")
         if self.max_parallel_tasks > 1:
             raise PipelineError(
-                "suites would share one policy, which keeps the actions of one batch",
+                "parallel suites would share one policy, which stores the actions of one batch",
                 where="env.max_parallel_tasks",
                 expected="1",
-                remedy="--eval.batch_size runs episodes beside each other",
+                remedy="set --eval.batch_size to run several episodes at the same time",
             )
         given = {name: getattr(self, name) for name in ("prompt", "seed", "step_limits")}
         settings = EpisodeSettings.model_validate({**given, "runner": "lerobot-eval"})
@@ -143,10 +143,10 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
         folder = get_path_arg("policy")
         if folder is None or not Path(folder).is_dir():
             raise PipelineError(
-                f"rows name a policy by the content of its files, and {folder} is no folder",
+                f"rows identify a policy by the content of its files, but {folder} is no folder",
                 where="policy.path",
                 expected="a folder that lerobot saved a policy in",
-                remedy="hf download REPOSITORY --local-dir DIR, and --policy.path=DIR",
+                remedy="run `hf download REPOSITORY --local-dir DIR`, then set --policy.path=DIR",
             )
         policy = PolicyConfig(kind="checkpoint", address=folder, label=self.label)
         return Evaluation(settings, policy, policy.identity(), Path(self.out), archive=archive)

@@ -205,7 +205,7 @@ def unpacked(folder: Path) -> Path:
         below = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
         if len(below) != 1:
             raise PipelineError(
-                "not the unpacked asset archive of LIBERO-Plus",
+                "the folder is not the unpacked asset archive of LIBERO-Plus",
                 where=root,
                 expected="a folder with scenes, textures and new_objects, or one that leads to it",
                 remedy="unpack assets.zip of the dataset Sylvest/LIBERO-plus, and name that folder",
@@ -259,7 +259,9 @@ def _referred(file: Edition) -> tuple[str, ...]:
     try:
         return tuple(element.attrib["file"] for element in ET.parse(file.path).iterfind(".//*[@file]"))
     except ET.ParseError as error:
-        raise PipelineError(f"not XML ({error})", where=file.path, remedy="unpack the archive again") from error
+        raise PipelineError(
+            f"the file is not XML ({error})", where=file.path, remedy="unpack the archive again"
+        ) from error
 
 
 def scene_files(test: TestTask) -> SceneFiles:

@@ -233,7 +233,9 @@ def _edition(file: Path) -> Edition:
     try:
         return edition(file)
     except OSError as error:
-        raise PipelineError(f"cannot be read ({error})", where=file, expected="data/<run>/plan.parquet") from error
+        raise PipelineError(
+            f"the plan cannot be read ({error})", where=file, expected="data/<run>/plan.parquet"
+        ) from error
 
 
 def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:

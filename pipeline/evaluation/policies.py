@@ -161,7 +161,7 @@ class Server:
         self._loop.close()
 
     def _connect(self) -> None:
-        """Connect to the server, and read what it announces.
+        """Connect to the server, and read its announcement.
 
         Raises:
             PipelineError: if no server answers, or if its actions cannot be executed. It is no ``PolicyError``, because
@@ -204,16 +204,16 @@ class Server:
             raise self._fault(f"no answer within {self._connection.timeout:g} s") from error
         except (OSError, RuntimeError, ValueError, WebSocketException) as error:
             what = str(error) or type(error).__name__
-            raise self._fault(f"the model server does not answer as it should ({what})") from error
+            raise self._fault(f"the model server gives no valid answer ({what})") from error
 
     def _fault(self, what: str) -> PolicyError:
         """Close the connection, and return an error."""
         self._loop.run_until_complete(self._connection.close())
-        return PolicyError(what, where=self.name, remedy="see the server's log")
+        return PolicyError(what, where=self.name, remedy="read the server's log")
 
 
 def warn_of_single_view(address: str, timeout_s: float) -> None:
-    """Log a warning if a server announces none of ``REQUESTS``, because its author may have forgotten to ask.
+    """Log a warning if a server announces none of ``REQUESTS``, because its author may have forgotten it.
 
     Args:
         address: address of the server, such as ``ws://localhost:8000``.
@@ -268,7 +268,11 @@ class Checkpoint:
         cameras = {SCHEMA.views[view].lerobot_key: name for name, view in VIEWS.items()}
         unknown = ", ".join(key for key in config.image_features if key not in cameras)
         if unknown:
-            raise PipelineError(f"the policy wants the images {unknown}", where=folder, expected=", ".join(cameras))
+            raise PipelineError(
+                f"the policy needs the images {unknown}, which the tasks do not have",
+                where=folder,
+                expected=", ".join(cameras),
+            )
         self._cameras = {key: name for key, name in cameras.items() if key in config.image_features}
         self._sizes_px = {key: config.image_features[key].shape[1:] for key in self._cameras}
         chunked = getattr(config, "n_obs_steps", 1) == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
@@ -316,7 +320,9 @@ def content_of(checkpoint: Path) -> str:
         PipelineError: if the folder is not a checkpoint.
     """
     if not (checkpoint / "config.json").is_file():
-        raise PipelineError("no config.json", where=checkpoint, expected="a folder that lerobot saved a policy in")
+        raise PipelineError(
+            "the folder has no config.json", where=checkpoint, expected="a folder that lerobot saved a policy in"
+        )
     checksums: dict[str, str] = {}
     for path in checkpoint.rglob("*"):
         name = path.relative_to(checkpoint)

@@ -105,7 +105,7 @@ class EpisodeFiles:
         names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
         if set(names) - {"summary.json", LOGS.parts[0]}:
             raise PipelineError(
-                f"holds files and no results of an evaluation: {', '.join(sorted(names)[:3])}",
+                f"the folder has files but no results of an evaluation: {', '.join(sorted(names)[:3])}",
                 where=self.folder,
                 expected="a new or empty folder, or one of an earlier evaluation",
                 remedy="name another folder",
@@ -147,7 +147,7 @@ def _read(path: Path) -> EpisodeResult:
             location = ".".join(map(str, fault["loc"]))
             faults.append(f"{location}: {fault['msg']}")
         raise PipelineError(
-            f"not a result as this version writes it ({'; '.join(faults[:3])})",
+            f"the file is not a result of this version ({'; '.join(faults[:3])})",
             where=path,
             expected="one record of an episode, with its policy's identity, its prompt and its limit",
             remedy="evaluate again into another folder",
@@ -169,7 +169,7 @@ def stored(folders: Iterable[Path]) -> list[Stored]:
         rows = files.rows()
         if not rows:
             expected = "a folder that `python -m pipeline evaluate` wrote results into"
-            raise PipelineError("no results", where=files.folder, expected=expected)
+            raise PipelineError("the folder has no results", where=files.folder, expected=expected)
         results += [(row, files) for row in rows]
     return results
 
@@ -182,9 +182,9 @@ def one_setting(results: Sequence[Stored]) -> dict[str, Any]:
     """
     _agree(
         (("", {"identity": row.identity, **row.settings}, files.path(row.episode)) for row, files in results),
-        "results of several policies or settings",
+        "the results have several policies or settings",
         expected="one policy under one setting",
-        remedy="give each a folder of its own; evaluate a server that has changed under another --label",
+        remedy="give each policy and setting a folder of its own; evaluate a changed server under another --label",
     )
     return results[0][0].settings if results else {}
 
@@ -207,12 +207,12 @@ def refuse_different(results: Iterable[Stored], across: Collection[str] | None =
         facts = {"prompt": row.prompt, "step_limit": row.step_limit, **settings}
         return {name: value for name, value in facts.items() if name not in (across or ())}
 
-    choice = "; where the difference is what you compare, --across prompt, --across step_limit or --across black"
+    choice = "; or compare across the difference by --across prompt, --across step_limit or --across black"
     _agree(
         ((f"{row.source}/{row.suite}", alike(row), files.path(row.episode)) for row, files in results),
-        "these results cannot be compared, on ",
+        "these results cannot be compared on ",
         expected="one prompt, one step limit, the same black views and starts for all that is compared",
-        remedy=f"evaluate both alike, or leave one of the folders out{'' if across is None else choice}",
+        remedy=f"evaluate both with equal settings, or leave one of the folders out{'' if across is None else choice}",
     )
 
 
@@ -298,9 +298,9 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     _agree(
         outcomes,
         "two results of ",
-        expected="one result of each episode, the same wherever it was run",
-        remedy="leave one of the folders out; run the one again that other versions of the packages made, or give each "
-        "of two policies behind a server a --label of its own",
+        expected="one result of each episode, equal in all folders",
+        remedy="leave one of the folders out; evaluate again the results of other package versions, or give each of "
+        "two policies behind a server a --label of its own",
     )
     by_episode = grouped((result[0].episode, result) for result in results)
     once = [same_episode[0] for same_episode in by_episode.values()]

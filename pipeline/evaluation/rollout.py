@@ -38,8 +38,8 @@ PACKAGES = ("robouse", "opencv-python-headless")
 CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
 """Packages that compute a checkpoint's actions."""
 
-REMAKE = f"`{identity.REMAKE}=1` before the command; or evaluate into another folder"
-"""Remedy that tells a person how to allow that results are generated again."""
+REMAKE = f"put `{identity.REMAKE}=1` before the command; or evaluate into another folder"
+"""Remedy by which a person allows results to be generated again."""
 
 RECORDED = ("pipeline", "vla-eval")
 """Versions of a result that do not decide whether the result is up to date."""
@@ -75,8 +75,8 @@ class PolicyConfig(Frozen, use_attribute_docstrings=True):
                 raise PipelineError(
                     "this server has no label",
                     where=self.address,
-                    expected="--label NAME, another for each policy: an address does not tell what is behind it, and "
-                    "results of another policy there would be taken for this one's",
+                    expected="--label NAME, a different one for each policy: an address does not identify a policy, so "
+                    "results of another policy at it would count as results of this policy",
                 )
             case "server":
                 return f"claimed:{self.label}"
@@ -107,8 +107,8 @@ class Evaluation:
 
     Attributes:
         identity: identity of the policy when the evaluation began.
-        videos: episodes of which a video is kept, among those that this evaluation runs. A video shows the policy's
-            observations and the end of the episode.
+        videos: kind of episodes of which this evaluation keeps a video. A video shows the policy's observations and the
+            end of the episode.
         archive: folder of LIBERO-Plus's asset archive, if there is one.
     """
 
@@ -149,7 +149,7 @@ class Evaluation:
             row = self.files.row(self.episode(task))
             reason = None if row is None else _record(row).why_not(self.basis(task), PER_TASK)
             if reason is not None:
-                outdated[f"episodes, made with {reason}"] += 1
+                outdated[f"episodes, generated with {reason}"] += 1
         identity.refuse_unasked(outdated, self.folder, REMAKE)
 
     def basis(self, task: EvaluationTask) -> Basis:

@@ -92,7 +92,7 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
     unknown = _of_unknown_level(listed, selection)
     if unknown:
         counts = ", ".join(f"{axis} {count}" for axis, count in unknown.items())
-        print(f"left out, because the parameters do not tell their level (0): {counts}")
+        print(f"left out, because their parameters do not state their level (0): {counts}")
     if selection.source == "libero_plus" and selection.file is None:
         wanted = _runnable(wanted, selection, archive)
     if not wanted:
@@ -119,7 +119,9 @@ def _check_names(selection: Selection) -> None:
     if selection.file is not None:
         if "source" in selection.model_fields_set:
             raise PipelineError(
-                f"{selection.file} is in place of a source", where="source", remedy="leave --source or --tasks-from out"
+                f"{selection.file} takes the place of a source",
+                where="source",
+                remedy="leave --source or --tasks-from out",
             )
         return
     if selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
@@ -127,7 +129,7 @@ def _check_names(selection: Selection) -> None:
             f"a task has {INITIAL_STATES} initial states, not {selection.episodes}",
             where="episodes",
             expected=f"at most {INITIAL_STATES}",
-            remedy="held-out perturbations can be more: --source own",
+            remedy="use --source own, whose held-out perturbations are not limited",
         )
     if selection.source == "pairs" and (selection.subset or selection.components):
         raise PipelineError(
@@ -143,7 +145,7 @@ def _check_names(selection: Selection) -> None:
                     f"{axis} has no held-out perturbations: {reason}",
                     where="axes",
                     expected=" or ".join(OWN_AXES),
-                    remedy=f"--source libero_plus --axis {axis}, the benchmark's test tasks, which plans keep clear of",
+                    remedy=f"use --source libero_plus --axis {axis}: test tasks, from which plans keep their clearance",
                 )
         _check_known("axes", selection.axes, OWN_AXES, selection)
         _check_known("levels", selection.levels, LEVELS, selection)
@@ -257,7 +259,7 @@ def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> Pip
                 names = " or ".join(str(value) for value in sorted(values))
                 alternatives.append(f"{field} {names}")
     return PipelineError(
-        "no task is left",
+        "no task matches the selection",
         where=f"selection {selection.model_dump(mode='json', exclude_defaults=True)}",
         expected="with the other restrictions as they are, " + "; or ".join(alternatives) if alternatives else None,
     )
@@ -333,7 +335,7 @@ def construct(
     for row in results:
         if row.seed != seed:
             raise PipelineError(
-                f"a result of seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
+                f"the result has seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
             )
         if row.reason == REFUSED:
             refused.add(str(row))

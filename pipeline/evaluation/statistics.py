@@ -9,8 +9,8 @@ that are resampled matters:
   trials, and the interval generalises to other tasks of this kind. Trials are not resampled within the base tasks,
   because their scatter would count twice: simulated intervals of five trials per task cover 97.8 to 99.5 %.
 * Fewer base tasks are fixed. The bootstrap resamples trials within each base task, and the interval is about these
-  tasks alone. Few base tasks tell too little about other tasks: simulated, a plain bootstrap that resamples four base
-  tasks covers 73 to 97 % instead of 95 %.
+  tasks alone. Few base tasks are too small a sample of other tasks: in simulations, a plain bootstrap that resamples
+  four base tasks covers 73 to 97 % instead of 95 %.
 * If a base task has fewer than ``FEW`` trials, the bootstrap resamples all trials as if they had one base task. The
   interval is wider.
 

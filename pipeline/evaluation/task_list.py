@@ -45,15 +45,15 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
         drawn = listed.drawn()
     except (OSError, ValueError, LookupError) as error:
         raise PipelineError(
-            f"not a list of tasks ({error})", where=file, expected="a file that `analyze construct` wrote"
+            f"the file is not a list of tasks ({error})", where=file, expected="a file that `analyze construct` wrote"
         ) from error
     if listed.seed != seed:
         raise PipelineError(
-            f"these tasks were drawn under seed {listed.seed}, not {seed}", where=file, remedy=f"--seed {listed.seed}"
+            f"these tasks were sampled under seed {listed.seed}, not {seed}", where=file, remedy=f"--seed {listed.seed}"
         )
     if listed.draws != drawn:
         raise PipelineError(
-            "this version draws other perturbations for these tasks",
+            "this version samples other perturbations for these tasks",
             where=file,
             expected="a list of this version",
             remedy="generate the list again with the same command, or evaluate with the version that generated it",

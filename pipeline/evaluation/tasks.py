@@ -172,7 +172,8 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
     """List the replacements of the objects that a task's goal puts somewhere.
 
     A new object can be moved and carries nothing. It is not in the goal yet, and the place is not named after it (a
-    region beside a plate is named after the plate). It is the only object of its category, and its words mean it alone.
+    region next to a plate is named after the plate). It is the only object of its category, and its words mean it
+    alone.
 
     The new object fits in the old object's place if one of LIBERO's 130 tasks puts its category on or in a thing of
     this kind. It also fits if it is no larger than an object that one of these tasks puts there.

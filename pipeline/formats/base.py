@@ -126,7 +126,7 @@ class Format(ABC, Generic[Options]):
     options_type: ClassVar[type[FormatOptions]]
     """Model of its options, which are a field of the section ``export`` under the format's name."""
     by_default: ClassVar[bool] = False
-    """True if a run writes the format unless its configuration says ``null``."""
+    """True if a run writes the format unless its configuration has ``null``."""
     recipe: ClassVar[int]
     """Recipe number (see ``pipeline/identity.py``); 1 for a new format."""
     packages: ClassVar[tuple[str, ...]]
@@ -192,7 +192,9 @@ class Format(ABC, Generic[Options]):
         try:
             return Export.from_json(json.loads(self.record_file.read_text()))
         except (OSError, LookupError, TypeError, ValueError) as error:
-            raise PipelineError(f"no finished dataset ({error})", where=self.record_file, remedy=MAKE_AGAIN) from error
+            raise PipelineError(
+                f"there is no finished dataset ({error})", where=self.record_file, remedy=MAKE_AGAIN
+            ) from error
 
     def written(self) -> list[Written]:
         """List the files of the finished dataset.
@@ -249,7 +251,7 @@ class Format(ABC, Generic[Options]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         """List the faults of the dataset as a whole.
 
-        Each comes with the name of its check: ``format``, ``ids``, ``splits`` or ``readable``.
+        Each fault comes with the name of its check: ``format``, ``ids``, ``splits`` or ``readable``.
 
         Args:
             kept: episode id to its row of the manifest.

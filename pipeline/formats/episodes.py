@@ -22,7 +22,7 @@ def too_few(share: float, where: str) -> PipelineError:
     return PipelineError(
         f"no task has enough demonstrations for {share:g} of them to go into the split val",
         where=where,
-        expected=f"{least} or more demonstrations of a task, where all that `demos expand` made from one count as one",
+        expected=f"{least} or more demonstrations of a task; expansions of one demonstration count as one",
         remedy="use more demonstrations, a larger share, or 0",
     )
 
@@ -102,9 +102,9 @@ class Episodes:
         """
         if not self.known:
             raise PipelineError(
-                "no episodes to write",
+                "there are no episodes to write",
                 expected="1 or more",
-                remedy="`python -m pipeline status CONFIG` lists kept episodes; else widen export.where, or filter",
+                remedy="list the kept episodes by `python -m pipeline status CONFIG`; widen export.where, or filter",
             )
         if not validation:
             return {"train": self.ids}

@@ -107,7 +107,7 @@ class Written:
             same = checksum(self.file) == self.sha256
         except OSError as error:
             return [Fault(self.dataset, None, f"{self.file}: cannot be read ({error})", expected)]
-        return [] if same else [Fault(self.dataset, None, f"{self.file}: was changed since it was written", expected)]
+        return [] if same else [Fault(self.dataset, None, f"{self.file}: has changed since it was written", expected)]
 
 
 def in_both_splits(

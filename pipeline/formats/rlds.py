@@ -36,8 +36,8 @@ class RldsConfig(FormatOptions):
         # OpenVLA-OFT decides by the name whether it reads a set with LIBERO's constants and cameras.
         if "libero" not in self.name or "aloha" in self.name:
             raise ValueError(
-                f"export.rlds.name {self.name!r} would be read with another robot's constants and cameras by "
-                "OpenVLA-OFT, which goes by the name; expected a name with libero and without aloha in it"
+                f"OpenVLA-OFT selects constants and cameras by the name, and export.rlds.name {self.name!r} would "
+                "select those of another robot; expected a name with libero and without aloha in it"
             )
 
 
@@ -128,7 +128,7 @@ for episode in builder.as_dataset(split="train"):
         image, action, text = step["observation"]["image"], step["action"], step["language_instruction"]
 """
         return f"""\
-The repository is laid out as the folder that `finetune/` expects, here `$DATA`:
+The repository has the layout that `finetune/` expects of the folder `$DATA`:
 
 ```sh
 export DATA=$PWD/{name}

@@ -43,8 +43,8 @@ def check(
     """Compare the metadata of the sets with the content of their files.
 
     The check covers the feature tree of this version, and every field of ``dataset_info.json`` that readers use. All
-    shards must exist and be complete, and the number of episodes must be that of the kept ones. No demonstration may be
-    in two splits.
+    shards must exist and be complete, and the number of episodes must be that of the kept episodes. No demonstration
+    may be in two splits.
     """
     stored = 0
     present = {file.parent.parent.name for file in root.glob("*/*/dataset_info.json")}
@@ -52,7 +52,7 @@ def check(
         folder = root / name / VERSION
         info = _info(folder)
         if info.features.to_json() != features(extras).to_json():
-            yield "format", Fault("rlds", None, f"features.json of {name} is another", "the one of this version")
+            yield "format", Fault("rlds", None, f"features.json of {name} differs", "that of this version")
         counts: dict[str, int] = {}
         for shard in sorted(folder.glob("*.tfrecord-*")):
             try:
@@ -61,13 +61,16 @@ def check(
                 yield "readable", Fault("rlds", None, str(error), "a whole file")
         for shard_name, length in _lengths(info).items():
             if shard_name in counts and counts[shard_name] != length:
-                expected = f"{length}, as dataset_info.json says"
+                expected = f"{length}, as dataset_info.json states"
                 yield "readable", Fault("rlds", None, f"{shard_name} has {counts[shard_name]} records", expected)
         yield from (("format", fault) for fault in _wrong_info(folder, info, counts, extras))
         stored += sum(counts.values())
     # Reading the episodes reports missing ones.
     if stored > len(kept):
-        yield "ids", Fault("rlds", None, f"has {stored} episodes, foreign ones or some twice", f"{len(kept)}")
+        yield (
+            "ids",
+            Fault("rlds", None, f"has {stored} episodes, of which some are foreign or repeated", f"{len(kept)}"),
+        )
     split_names = {split_of(file) for file in root.glob("*/*/*.tfrecord-*")}
     wanted = {"train", "val"} if validation else {"train"}
     if split_names != wanted:
@@ -107,8 +110,8 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tupl
         "version": stated.get("version"),
         "fileFormat": stated.get("fileFormat"),
         "filepathTemplate": sorted({split.get("filepathTemplate") for split in stated.get("splits", [])}),
-        "shards that it does not state": sorted({*existing} - _lengths(info).keys()),
-        "shards that are not there": sorted(_lengths(info).keys() - {*existing}),
+        "unlisted shards": sorted({*existing} - _lengths(info).keys()),
+        "missing shards": sorted(_lengths(info).keys() - {*existing}),
         "number of bytes": {split.name: split.num_bytes for split in info.splits.values()},
         "description": stated.get("description"),
         "homepage": stated.get("location", {}).get("urls"),
@@ -121,8 +124,8 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tupl
         "version": VERSION,
         "fileFormat": "tfrecord",
         "filepathTemplate": ["{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"],
-        "shards that it does not state": [],
-        "shards that are not there": [],
+        "unlisted shards": [],
+        "missing shards": [],
         **texts,
         "homepage": [texts["homepage"]],
     }

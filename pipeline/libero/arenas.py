@@ -130,7 +130,7 @@ ARENAS: dict[Arena, Room] = {
         frame_s=(0.022, 0.034),
     ),
 }
-"""Facts of each arena; a new arena is one more record. The floor is the last, as the others have a floor too."""
+"""Facts of each arena; a new arena is one more record. The floor comes last, because all arenas have a floor."""
 
 SURFACES = tuple(dict.fromkeys(room.surface_body for room in ARENAS.values()))
 """Bodies of LIBERO's arenas that objects stand on; the first body that an arena has is its working surface."""

@@ -67,14 +67,14 @@ def relocate(xml: str, where: str) -> str:
     """
 
     def refuse(
-        what: str, remedy: str = "do not use this file: LIBERO's own recordings hold no such thing"
+        what: str, remedy: str = "do not use this file: LIBERO's own recordings have no such content"
     ) -> PipelineError:
         """Return the error that rejects the model."""
         return PipelineError(what, where=where, expected="MJCF as LIBERO records it in model_file", remedy=remedy)
 
     # Entities can only be declared in a DOCTYPE, and no recording has one.
     if "<!DOCTYPE" in xml:
-        raise refuse("the model has a DOCTYPE, which can pull in other files")
+        raise refuse("the model has a DOCTYPE, which can include other files")
     try:
         root = ET.fromstring(xml)
     except (ET.ParseError, ValueError) as error:

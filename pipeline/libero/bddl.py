@@ -264,7 +264,7 @@ def read(path: Path) -> Bddl:
     try:
         return parse(path.read_text(encoding="utf-8"), path)
     except (OSError, UnicodeDecodeError) as error:
-        raise PipelineError(f"cannot be read ({error})", where=path, expected="a BDDL file") from error
+        raise PipelineError(f"the file cannot be read ({error})", where=path, expected="a BDDL file") from error
 
 
 def parse(text: str, where: object) -> Bddl:
@@ -276,7 +276,7 @@ def parse(text: str, where: object) -> Bddl:
     expected = "a BDDL problem with :language, :objects, :init and :goal"
     if text.startswith("\ufeff"):
         raise PipelineError(
-            "begins with a byte order mark (BOM), which LIBERO cannot read",
+            "the file begins with a byte order mark (BOM), which LIBERO cannot read",
             where=where,
             expected=expected,
             remedy="save the file as UTF-8 without BOM",
@@ -286,7 +286,7 @@ def parse(text: str, where: object) -> Bddl:
         section = _section_with_empty(tokens)
         if section:
             raise PipelineError(
-                f"has empty parentheses `()` in {section}",
+                f"the file has empty parentheses `()` in {section}",
                 where=where,
                 expected=expected,
                 remedy="remove them; a section without content is written as `(:fixtures)`",
@@ -306,9 +306,9 @@ def parse(text: str, where: object) -> Bddl:
     except PipelineError:
         raise
     except KeyError as error:
-        raise PipelineError(f"has no {error.args[0]}", where=where, expected=expected) from error
+        raise PipelineError(f"the file has no {error.args[0]}", where=where, expected=expected) from error
     except Exception as error:  # the tokeniser raises nothing more specific
-        raise PipelineError(f"not a BDDL file ({error})", where=where, expected=expected) from error
+        raise PipelineError(f"the file is not a BDDL file ({error})", where=where, expected=expected) from error
 
 
 def heading(text: str, where: object) -> tuple[str, str]:
@@ -322,7 +322,7 @@ def heading(text: str, where: object) -> tuple[str, str]:
     text = text.lower()
     problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
     if problem is None or language is None:
-        raise PipelineError("not a BDDL file", where=where, expected="a BDDL problem with :language")
+        raise PipelineError("the file is not a BDDL file", where=where, expected="a BDDL problem with :language")
     return problem[1], " ".join(language[1].split())
 
 

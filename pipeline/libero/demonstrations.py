@@ -190,9 +190,9 @@ class HDF5Source:
                             first = first_with.setdefault(entry.sha256, entry)
                             if first is not entry:
                                 raise PipelineError(
-                                    f"holds the same actions, states and model as {first.demo_id}",
+                                    f"has the actions, states and model of {first.demo_id}",
                                     where=f"{self._path(task)} data/{key}",
-                                    remedy="nothing has to be done: of two copies a run uses the first",
+                                    remedy="leave it as it is: a run uses the first of two copies",
                                 )
                             entries.append(entry)
                             usable += 1
@@ -238,7 +238,7 @@ class HDF5Source:
         folder = self.root / suite
         if not folder.is_dir():
             raise PipelineError(
-                "no such folder",
+                "there is no such folder",
                 where=folder,
                 expected="<root>/<suite>/<task>_demo.hdf5",
                 remedy="set demos.root to the folder that holds the suites, or use the starter set",
@@ -264,16 +264,16 @@ class HDF5Source:
             recorded = PurePosixPath(hdf5.text(data, "bddl_file_name", f"{path} data")).stem
             if base_of_test(recorded):
                 raise PipelineError(
-                    f"recorded in the test task {recorded!r} of LIBERO-Plus (bddl_file_name)",
+                    f"the file was recorded in the test task {recorded!r} of LIBERO-Plus (bddl_file_name)",
                     where=path,
                     expected="recordings in scenes that the benchmark does not test",
-                    remedy="leave it out of demos.tasks: a policy that is trained on it cannot be tested",
+                    remedy="leave its task out of demos.tasks: a policy that is trained on it cannot be tested",
                 )
             if recorded != task.name and _is_task(recorded):
                 raise PipelineError(
-                    f"named after one task but recorded for another, {recorded!r} (bddl_file_name)",
+                    f"the file is named after one task but was recorded for another, {recorded!r} (bddl_file_name)",
                     where=path,
-                    remedy=f"rename it to {recorded}_demo.hdf5",
+                    remedy=f"rename the file to {recorded}_demo.hdf5",
                 )
             reject_other_control(data, f"{path} data")
             yield data
@@ -293,7 +293,7 @@ class HDF5Source:
         if clipped:
             yield (
                 f"{path}: {sum(clipped.values())} actions of {len(clipped)} demonstrations are limited to [-1, 1], as "
-                f"robosuite does when it executes them, such as of {next(iter(clipped))}"
+                f"robosuite does when it executes them (first: {next(iter(clipped))})"
             )
 
     def _read(self, task: Task, key: str, data: h5py.Group) -> Demo:
@@ -305,7 +305,7 @@ class HDF5Source:
         path = self._path(task)
         where = f"{path} data/{key}"
         if not re.fullmatch(r"demo_\d+", key):
-            raise PipelineError("not a demonstration", where=where, expected="a group named demo_<number>")
+            raise PipelineError("the group is not a demonstration", where=where, expected="a group named demo_<number>")
         group = hdf5.member(data, key, h5py.Group, where)
         actions, states = hdf5.array(group, "actions", where), hdf5.array(group, "states", where)
         init_state = hdf5.numbers(group, "init_state", where)
@@ -363,10 +363,10 @@ class _Recorded(NamedTuple):
         unknown = commands.others(executed[:, 6])
         if unknown:
             raise PipelineError(
-                f"the gripper is told {min(unknown):g}",
+                f"the gripper has the command {min(unknown):g}",
                 where=where,
                 expected=f"{commands.open:g} (open) or {commands.close:g} (close) as the last number of each action",
-                remedy="set each to the nearer of the two in a copy of the file",
+                remedy="set each command to the nearer of the two in a copy of the file",
             )
         # Hash the model as recorded: a relocated model would differ from machine to machine.
         content = hashlib.sha256()

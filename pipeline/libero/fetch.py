@@ -41,7 +41,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
     for suite in suites:
         wanted += [f"{task}_demo.hdf5" for task in tasks(suite)]
     remedy = (
-        "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, the download resumes; "
+        "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run the command again, which resumes the download; "
         "or use the starter set, demos.source: starter, which needs no hub"
     )
     try:

@@ -26,14 +26,14 @@ The file may be its owner's only copy, so no remedy advises to delete it.
 """
 
 AS_RECORDED = (
-    "write it as LIBERO's create_dataset.py does, into a new file; or leave it as it is: a run does without it, if its "
-    "task has another demonstration"
+    "write it as LIBERO's create_dataset.py does, into a new file; or leave it as it is: a run skips it, if its task "
+    "has another demonstration"
 )
 """Remedy for an undamaged file whose content has another form."""
 
 _REPACK = (
-    "write a copy without compression, `h5repack -f NONE FILE COPY` (package hdf5-tools), where the filter's plugin is "
-    "installed: HDF5 has filters such as blosc not built in"
+    "write a copy without compression, `h5repack -f NONE FILE COPY` (package hdf5-tools), on a machine with the "
+    "filter's plugin: HDF5 itself lacks filters such as blosc"
 )
 REMEDIES = {
     "consistency flags": "copy the file, and clear the mark in the copy by `h5clear -s COPY` (package hdf5-tools): its "
@@ -41,7 +41,7 @@ REMEDIES = {
     "plugin": _REPACK,
     "filter": _REPACK,
 }
-"""Words of HDF5's own messages to the remedy."""
+"""Part of a message of HDF5 to the remedy."""
 
 EXPANDED_FROM, EXPANDED_FROM_SHA256, ORIGIN_SHA256 = "expanded_from", "expanded_from_sha256", "origin_sha256"
 """Attributes of a demonstration that an expansion generated.
@@ -64,7 +64,7 @@ def _undamaged(where: str) -> Iterator[None]:
         remedies = [remedy for words, remedy in REMEDIES.items() if words in str(error)]
         remedy = remedies[0] if remedies else GET_AGAIN
         raise PipelineError(
-            f"not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=remedy
+            f"the file is not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=remedy
         ) from error
 
 
@@ -76,7 +76,9 @@ def opened(path: Path) -> Iterator[h5py.File]:
         PipelineError: when the file is missing or truncated.
     """
     if not path.is_file():
-        raise PipelineError("no such file", where=path, remedy="download it, or leave its task out of demos.tasks")
+        raise PipelineError(
+            "there is no such file", where=path, remedy="download it, or leave its task out of demos.tasks"
+        )
     with _undamaged(str(path)):
         # Many workers read and no process writes, and locks fail on some network file systems.
         file = h5py.File(path, "r", locking=False)
@@ -113,7 +115,7 @@ def array(group: h5py.Group, name: str, where: str) -> Floats:
     dataset = member(group, name, h5py.Dataset, where)
     with _undamaged(where):
         if dataset.external or dataset.is_virtual:
-            raise PipelineError(f"{name!r} takes its numbers from another file", where=where, remedy=AS_RECORDED)
+            raise PipelineError(f"{name!r} stores its numbers in another file", where=where, remedy=AS_RECORDED)
         if dataset.dtype.kind != "f" or dataset.ndim != 2 or not 0 < dataset.size <= _MAX_NUMBERS:
             raise PipelineError(
                 f"{name!r} holds {dataset.dtype} of shape {dataset.shape}",

@@ -39,7 +39,7 @@ def reject_other_control(data: h5py.Group, where: str) -> None:
         differences = list(_differences(_arguments(data, attribute, where)))
         if differences:
             raise PipelineError(
-                f"recorded with other settings than LIBERO's: {'; '.join(differences)} ({attribute})",
+                f"the file was recorded with other settings than LIBERO's: {'; '.join(differences)} ({attribute})",
                 where=where,
                 expected=f"control_freq {SCHEMA.fps_hz}, and robosuite's controllers/config/osc_pose.json",
                 remedy=RECORD_AGAIN,

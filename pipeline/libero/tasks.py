@@ -24,7 +24,7 @@ Same = Literal["task", "scene"]
 
 _OF_FILES = ("scene", "suite", "libero", "bddl", "benchmark", "hdf", "demo")
 _DEBRIS = re.compile(rf"[_\d/\\]|\b({'|'.join(_OF_FILES)})\b", re.IGNORECASE)
-WITHOUT_DEBRIS = f"an instruction without digits, _, /, \\ and the words {', '.join(_OF_FILES)}, as of a file's name"
+WITHOUT_DEBRIS = f"an instruction without digits, _, /, \\ and the words {', '.join(_OF_FILES)} of file names"
 
 _TESTED = re.compile(
     r"(?P<base>.+?)(?:_language_\d+|_view(?:_\d+){5}_initstate_\d+|_noise_\d+|_table_\d+|_tb_\d+|_light_\d+|_add_\d+"
@@ -51,11 +51,11 @@ def suites() -> tuple[str, ...]:
         # with aloha in their name to another robot.
         if f"libero_{name}" in SUITES or not re.fullmatch(r"(?!libero_|val$|.*aloha)[a-z][a-z0-9_]*(?<!_val)", name):
             raise PipelineError(
-                f"a suite cannot be called {name!r}",
+                f"a suite cannot have the name {name!r}",
                 where=OWN / name,
                 expected="lower-case letters, digits and _; none of LIBERO's suites, with or without libero_; no aloha "
                 "in it, and neither val nor _val at its end",
-                remedy="rename the folder, and that of its demonstrations",
+                remedy="rename the folder, and the folder of its demonstrations",
             )
     return (*SUITES, *own_suites)
 
@@ -88,14 +88,17 @@ def _reject_unusable(task: Task) -> None:
     base = base_of_test(task.name)
     if base:
         raise PipelineError(
-            f"is called as a test task of LIBERO-Plus, which perturbs {base}",
+            f"the task has the name of a test task of LIBERO-Plus, which perturbs {base}",
             where=task.bddl_file,
             expected="a task that the benchmark does not test",
             remedy="leave test tasks out of the suite: a policy that is trained on them cannot be tested",
         )
     if not task.instruction.strip():
         raise PipelineError(
-            "the instruction is empty", where=task.bddl_file, expected="(:language <a sentence>)", remedy="write one"
+            "the instruction is empty",
+            where=task.bddl_file,
+            expected="(:language <a sentence>)",
+            remedy="write an instruction",
         )
     remnant = debris(task.instruction)
     if remnant:
@@ -103,7 +106,7 @@ def _reject_unusable(task: Task) -> None:
             f"the instruction {task.instruction!r} has {remnant!r}",
             where=task.bddl_file,
             expected=WITHOUT_DEBRIS,
-            remedy="write numbers as words, and others in place of these, in (:language ...)",
+            remedy="write numbers as words, and replace the other listed texts, in (:language ...)",
         )
 
 

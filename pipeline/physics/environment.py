@@ -37,7 +37,7 @@ class UnusableSceneError(PipelineError):
             what,
             where=str(task),
             expected="the scene of this task, and time, qpos and qvel of the same model",
-            remedy="use demonstrations recorded with this LIBERO version, or ones that carry their model_file",
+            remedy="use demonstrations recorded with this LIBERO version, or demonstrations with a model_file",
         )
         self.reason = reason
 
@@ -125,7 +125,7 @@ class Environment:
                 self._open(scene.model_xml)
             except (ValueError, KeyError, mujoco.FatalError) as error:
                 # MuJoCo raises these errors while it compiles; robosuite raises them if the model lacks a name.
-                what = f"the scene is refused ({error!s:.300})"
+                what = f"the scene is rejected ({error!s:.300})"
                 raise UnusableSceneError("scene_refused", what, self.task) from error
             self._check_names()
             self._scene, self._site_rgba = scene.model_xml, env.sim.model.site_rgba.copy()
@@ -287,7 +287,7 @@ class Environment:
 
     @property
     def site_alpha(self) -> NDArray[np.float32]:
-        """Return the opacity of each site, (nsite,); LIBERO lights a stove's burner by making its site visible."""
+        """Return the opacity of each site, (nsite,); LIBERO lights a stove's burner by showing its site."""
         return np.array(self._env.sim.model.site_rgba[:, 3], np.float32)
 
     def succeeded(self) -> bool:

@@ -1,6 +1,6 @@
 """Rendering of a scene by MuJoCo's public functions alone.
 
-Any other drawing (``savings.py``) must render equal pixels.
+Subclasses of ``PlainDrawing`` (``savings.py``) must render equal pixels.
 """
 
 from collections.abc import Callable, Collection
@@ -42,9 +42,9 @@ def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> 
 
 
 class PlainDrawing:
-    """Drawing of a whole model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in its own context.
+    """Rendering of a whole model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in its own context.
 
-    Close it before you create another drawing.
+    Close it before you create the next ``PlainDrawing``.
 
     Attributes:
         steps_ahead: number of steps, of up to two views each, to start by ``start_frame`` before the frames of an
@@ -58,7 +58,7 @@ class PlainDrawing:
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
-        """Return whether this drawing can render a model; the plain drawing can render every model."""
+        """Return whether this class can render a model; ``PlainDrawing`` can render every model."""
         return True
 
     def __init__(self, model: mujoco.MjModel):
@@ -84,7 +84,7 @@ class PlainDrawing:
     def adopt(self, model: mujoco.MjModel) -> bool:
         """Switch to another model in the same OpenGL context if possible, and return whether it was; here it never is.
 
-        If the result is False, nothing has changed. After an error, the drawing has to be closed.
+        If the result is False, nothing has changed. After an error, close this ``PlainDrawing``.
         """
         return False
 
@@ -100,7 +100,7 @@ class PlainDrawing:
     def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
         """Start to render a frame, and return a function that waits for the frame and returns it.
 
-        The state may change meanwhile. Here the frame is rendered at once; other drawings let the device work on.
+        The state may change meanwhile. Here the frame is rendered at once; subclasses let the device continue to work.
         """
         frame = self.frame(data, camera)
         return lambda: frame
@@ -148,7 +148,7 @@ class PlainDrawing:
         self._context.free()
 
     def _draw(self, data: mujoco.MjData, camera: str) -> None:
-        """Render a picture into the off-screen buffer of the current context."""
+        """Render a frame into the off-screen buffer of the current context."""
         self._update(data, camera)
         self._render()
 

@@ -39,8 +39,8 @@ In LIBERO's five arenas, MuJoCo 3.2.7 causes no error. OpenGL has a limited numb
 head light. In a scene with more lights, MuJoCo also enables and disables lights that OpenGL lacks; they stay dark.
 """
 
-_MEMORY = "fewer workers on this machine (compute.workers), smaller textures, or a GPU with more memory"
-_DRIVER = "MUJOCO_GL=osmesa, which renders in software; and report this message with the driver's version"
+_MEMORY = "use fewer workers on this machine (compute.workers), smaller textures, or a GPU with more memory"
+_DRIVER = "set MUJOCO_GL=osmesa, which renders in software, and report this message with the driver's version"
 
 
 def calls() -> Any:
@@ -94,7 +94,7 @@ def making_context() -> Iterator[None]:
     try:
         yield
     except mujoco.FatalError as error:
-        raise failure(f"MuJoCo makes no OpenGL context: {error}", f"{_MEMORY}; or {_DRIVER}") from error
+        raise failure(f"MuJoCo cannot create an OpenGL context: {error}", f"{_MEMORY}; or {_DRIVER}") from error
     finally:
         mujoco.set_mju_user_warning(former)
     for warning in warnings:
@@ -141,7 +141,7 @@ def _stopping(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 def _reported(error: str, call: str) -> PipelineError:
     """Return the error to raise for an OpenGL error in a call."""
     remedy = _MEMORY if error == "GL_OUT_OF_MEMORY" else _DRIVER
-    return failure(f"OpenGL reports {error} in {call}, so that pictures may be wrong", remedy)
+    return failure(f"OpenGL reports {error} in {call}, so frames may be wrong", remedy)
 
 
 def failure(what: str, remedy: str = _DRIVER) -> PipelineError:

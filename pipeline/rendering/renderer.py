@@ -22,7 +22,7 @@ class Renderer:
 
     Args:
         scene: the scene's MJCF, or a compiled model, which then belongs to the renderer.
-        drawing: an open drawing of the model; by default a new drawing.
+        drawing: an open ``PlainDrawing`` of the model; by default it is created.
 
     Attributes:
         site_alpha: (nsite,) the sites' opacity in the first state.
@@ -101,7 +101,7 @@ class LastScene:
     """Holder of the open renderer; at most one renderer is open at a time.
 
     Repeated requests for a scene return its renderer. A request for another scene returns a new renderer. It takes over
-    the drawing and its OpenGL context if the drawing can ``adopt`` the scene.
+    the ``PlainDrawing`` and its OpenGL context if ``adopt`` accepts the scene.
     """
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class LastScene:
         try:
             adopted = self._renderer is not None and self._renderer.drawing.adopt(model)
         except BaseException:
-            # The drawing may hold parts of both scenes now.
+            # The context may have parts of both scenes now.
             self.close()
             raise
         if self._renderer is not None and adopted:

@@ -72,17 +72,17 @@ SCENE = f"""
 
 
 def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
-    """Create a drawing of a model, with savings if they can be used."""
+    """Create the ``PlainDrawing`` of a model, with savings if they can be used."""
     if why_plain() is None:
         kind = kind_with_savings(gl.choose())
         if kind.possible(model):
             return kind(model)
-        _say("a scene has height fields, skins, a floor without bounds, or not four samples a pixel")
+        _say("a scene has height fields, skins, an unbounded floor, or another number than four samples a pixel")
     return PlainDrawing(model)
 
 
 def kind_with_savings(choice: gl.GlChoice) -> type[PlainDrawing]:
-    """Return the kind of drawing that renders fastest on a device.
+    """Return the kind of ``PlainDrawing`` that renders fastest on a device.
 
     In software, rendering a face takes longer than the choice of faces, so all savings are used. A GPU that few
     processes use would wait for their choice of geoms, so all geoms are rendered, with frames in flight.
@@ -131,7 +131,7 @@ def _say(reason: str) -> None:
 
 
 def fault(kind: type[PlainDrawing]) -> str | None:
-    """Return the error or the difference that a kind of drawing causes here; ``None`` if all pixels are equal."""
+    """Return the error or the difference that savings of a kind cause here; ``None`` if all pixels are equal."""
     try:
         plain, saving = frames(PlainDrawing), frames(kind)
     except PipelineError as error:
@@ -142,7 +142,7 @@ def fault(kind: type[PlainDrawing]) -> str | None:
 
 
 def frames(kind: type[PlainDrawing]) -> list[Frame]:
-    """Render the small scene in all states by one kind of drawing."""
+    """Render the small scene in all states by one kind of ``PlainDrawing``."""
     model = mujoco.MjModel.from_xml_string(SCENE)
     data, started = mujoco.MjData(model), []
     with closing(kind(model)) as drawing:

@@ -54,7 +54,9 @@ class LanguageModel:
         address = urllib.parse.urlsplit(self.endpoint)
         if address.scheme not in ("http", "https") or not address.hostname:
             raise PipelineError(
-                "not an address", where=f"endpoint {self.endpoint!r}", expected="such as http://localhost:8000/v1"
+                "the endpoint is not an address",
+                where=f"endpoint {self.endpoint!r}",
+                expected="such as http://localhost:8000/v1",
             )
 
     def __call__(self, prompt: str) -> str:
@@ -77,7 +79,7 @@ class LanguageModel:
         raise PipelineError(
             f"no answer in {ATTEMPTS} attempts: {'; '.join(dict.fromkeys(faults))}",
             where=self._url,
-            remedy="see that the server runs and keeps up, then run it again: what was accepted so far is kept",
+            remedy="check that the server runs and keeps up, then run the command again: accepted rewrites are kept",
         )
 
     @property
@@ -110,7 +112,7 @@ class LanguageModel:
                         raise TimeoutError(f"no whole answer within {self.timeout_s:g} s")
         except (httpx.InvalidURL, ImportError, ValueError) as error:  # a proxy in the environment raises the last two
             raise PipelineError(
-                f"cannot ask ({error})", where=self._url, expected="an http or https address"
+                f"the endpoint cannot be asked ({error})", where=self._url, expected="an http or https address"
             ) from error
         except (OSError, httpx.HTTPError) as error:
             raise _BusyError(str(error) or type(error).__name__) from error
@@ -122,7 +124,7 @@ class LanguageModel:
             retry_after = response.headers.get("Retry-After", "")
             raise _BusyError(fault, float(retry_after) if retry_after.isdigit() else 0.0)
         raise PipelineError(
-            f"the endpoint refuses the question ({fault})",
+            f"the endpoint rejects the question ({fault})",
             where=self._url,
             expected=f"a chat completion by the model {self.model!r}",
             remedy="check the endpoint, the model's name and the environment variable OPENAI_API_KEY",

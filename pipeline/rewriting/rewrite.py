@@ -94,7 +94,7 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
         ask: answers a prompt, such as a ``LanguageModel``.
 
     Raises:
-        PipelineError: when a file cannot be read, the model cannot be reached, or too few rewrites were acceptable.
+        PipelineError: when a file cannot be read, the model cannot be reached, or too few rewrites are accepted.
     """
     task_brief = brief(bddl_file)
     bank = read_bank(out) if out.exists() else {}
@@ -126,10 +126,10 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     if any(len(stored[component]) < per_class for component in CLASSES):
         counts = ", ".join(f"{component} {len(stored[component])}" for component in CLASSES)
         raise PipelineError(
-            f"too few acceptable rewrites of {task}: {counts}{_because(refused)}",
+            f"the model gave too few acceptable rewrites of {task}: {counts}{_because(refused)}",
             where=out,
             expected=f"{per_class} of each class",
-            remedy="run it again, it goes on from what was accepted; or ask another model",
+            remedy="run the command again, which resumes from the accepted rewrites; or ask another model",
         )
 
 
@@ -143,7 +143,7 @@ def _check_stored(stored: Mapping[Component, Sequence[str]], task: Task, out: Pa
         for text in texts:
             fault = lint(text, task, component)
             if fault:
-                what = f"{component} rewrite {text!r} of {task} is refused: {fault}"
+                what = f"{component} rewrite {text!r} of {task} is rejected: {fault}"
                 raise PipelineError(what, where=out, remedy=REMEDY)
 
 
@@ -179,7 +179,7 @@ def _sift(
 def _because(reasons: Counter[str]) -> str:
     """Format the reasons of rejected rewrites, the most common first; empty if there are none."""
     counted = "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common())
-    return f" (refused: {counted})" if counted else ""
+    return f" (rejected: {counted})" if counted else ""
 
 
 _THOUGHT = re.compile(r"<think>.*?</think>", re.DOTALL)

@@ -102,7 +102,7 @@ class Reader:
         """
         match = _NAME.fullmatch(name)
         if match is None or match["base"] not in self._bases[suite]:
-            raise PipelineError(f"cannot tell what the test task {name!r} changes", where=suite)
+            raise PipelineError(f"the name of the test task {name!r} does not state its change", where=suite)
         base = self._bases[suite][match["base"]]
         # Each task changes one thing; if a name lists several changes, the others have their neutral values.
         if match["noise"]:

@@ -45,7 +45,7 @@ def reject_test_tasks(wanted: Iterable[Task], folder: Path = FOLDER) -> None:
         if equal is not None:
             part, test_task = equal
             raise PipelineError(
-                f"has the {part} of LIBERO-Plus's test task {test_task}",
+                f"the task has the {part} of LIBERO-Plus's test task {test_task}",
                 where=task.bddl_file,
                 expected="a task that the benchmark does not test",
                 remedy="change it, or leave it out of demos.tasks: a policy that is trained on it cannot be tested",

@@ -1,8 +1,8 @@
 """Distance of a dataset from the benchmark's test tasks, also of third-party and of edited datasets.
 
-The audit first reads what an episode shows: the instruction, and the camera's matrices if the dataset has them. For
-the other axes it needs this project's labels (``perturbations``). They come from the dataset or, by ``episode_id``,
-from a manifest.
+The audit first reads the visible content of an episode: the instruction, and the camera's matrices if the dataset has
+them. For the other axes it needs this project's labels (``perturbations``). They come from the dataset or, by
+``episode_id``, from a manifest.
 """
 
 import json
@@ -137,7 +137,7 @@ def read(dataset: Path) -> Iterator[StoredEpisode]:
     lerobot = _visible_files(dataset, "meta/info.json")
     if not rlds and not lerobot:
         raise PipelineError(
-            "no dataset below this folder",
+            "there is no dataset below this folder",
             where=dataset,
             expected="features.json, as TFDS writes it, or meta/info.json, as lerobot does",
         )
@@ -147,7 +147,7 @@ def read(dataset: Path) -> Iterator[StoredEpisode]:
         for file in lerobot:
             yield from _lerobot(file.parents[1])
     except (OSError, ValueError, KeyError) as error:
-        raise PipelineError(f"cannot be read ({type(error).__name__}: {error})", where=dataset) from error
+        raise PipelineError(f"the dataset cannot be read ({type(error).__name__}: {error})", where=dataset) from error
 
 
 def _visible_files(folder: Path, name: str) -> list[Path]:
@@ -205,7 +205,7 @@ def _ids(folder: Path) -> dict[int, str]:
 
 def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
     names = ["episode_id", *LABELS]
-    rows = read_table(file, names, remedy="name the manifest of the run that the dataset is from").select(names)
+    rows = read_table(file, names, remedy="name the manifest of the dataset's run").select(names)
     return {row["episode_id"]: row for row in rows.to_pylist()}
 
 
@@ -231,7 +231,7 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
 
 
 def _labels(episode: StoredEpisode) -> list[Perturbation]:
-    """Return the labels of an episode except those that its instruction shows."""
+    """Return the labels of an episode, without labels that its instruction shows."""
     labels = () if episode.perturbations is None else from_json(episode.perturbations)
     return [p for p in labels if AXES[p.axis].audited != "instructions"]
 

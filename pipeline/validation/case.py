@@ -33,7 +33,7 @@ class Seen:
 
     @cached_property
     def grey(self) -> dict[int, NDArray[np.uint8]]:
-        """The frames in grey, (H, W) each."""
+        """Frames in grey, (H, W) each."""
         grey = {}
         for step, frame in self.frames.items():
             grey[step] = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)

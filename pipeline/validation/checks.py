@@ -71,9 +71,9 @@ def motion(case: Case) -> Iterator[Fault]:
     """Check actions, states and joint angles, bit for bit; actions and joint angles must be the replay's."""
     replay = case.trajectory
     if not _same(case.made.joint_state, replay.states[:-1, ARM].astype(np.float32)):
-        yield case.finding("frames", "has other joint angles", "those of the replay")
+        yield case.finding("frames", "has other joint angles", "the joint angles of the replay")
     if not _same(case.made.action, replay.actions.astype(np.float32)):
-        yield case.finding("frames", "has other actions", "those that the replay executed")
+        yield case.finding("frames", "has other actions", "the actions of the replay")
     for copy in case.copies:
         # Copies of another length cannot be compared; ``length`` reports them.
         for name in MOTION if len(copy) == len(case.made) else ():
@@ -147,7 +147,7 @@ def place(case: Case) -> Iterator[Fault]:
     for copy in case.copies:
         stated = {column: case.row[column] for column in copy.place}
         if stated != copy.place:
-            yield case.finding("manifest", _listed(stated), f"{_listed(copy.place)}, where it lies")
+            yield case.finding("manifest", _listed(stated), f"{_listed(copy.place)}, its place in the dataset")
 
 
 def jpeg(case: Case) -> Iterator[Fault]:
@@ -173,7 +173,7 @@ def geometry(case: Case) -> Iterator[Fault]:
                 if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
         if not _same(copy.episode.object_poses, case.made.object_poses):
-            yield case.finding(copy.dataset, "object_poses differ", "the stored ones")
+            yield case.finding(copy.dataset, "object_poses differ", "the stored poses")
         if list(copy.episode.instances) != list(case.made.instances):
             yield case.finding(copy.dataset, f"instances {list(copy.episode.instances)}", list(case.made.instances))
 

@@ -20,7 +20,7 @@ from pipeline.run.replay_job import ReplayJob
 from pipeline.testset.own_tasks import reject_test_tasks
 from pipeline.types import Task
 
-LAYOUT = "<suite>/<task>_demo.hdf5, with a suite of LIBERO's or of one's own, whose tasks are tasks/<suite>/<task>.bddl"
+LAYOUT = "<suite>/<task>_demo.hdf5, of a suite of LIBERO, or of an own suite with tasks/<suite>/<task>.bddl"
 
 
 @dataclass
@@ -78,18 +78,18 @@ def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayC
             first = first_with.setdefault(entry.sha256, entry)
             if first.demo_id != entry.demo_id:
                 remedy = "leave the task of one of the two out of demos.tasks"
-                result.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: {remedy}")
+                result.faults.append(f"{entry.demo_id}: has the content of {first.demo_id}\n  try: {remedy}")
     return result
 
 
 def _task_of(file: Path, root: Path) -> Task:
     suite, *name = file.relative_to(root).parts
     if suite not in suites() or len(name) != 1 or not name[0].endswith("_demo.hdf5"):
-        raise PipelineError("is not where a run looks", where=file, expected=LAYOUT, remedy="move or rename it")
+        raise PipelineError("no run reads this file", where=file, expected=LAYOUT, remedy="move or rename the file")
     try:
         return find_task(suite, name[0].removesuffix("_demo.hdf5"))
     except PipelineError as error:
-        remedy = error.remedy or "move or rename it"
+        remedy = error.remedy or "move or rename the file"
         raise PipelineError(error.what, where=error.where or file, expected=error.expected, remedy=remedy) from error
 
 
@@ -109,7 +109,7 @@ class _FileJob:
         faults = [str(problem.error) for problem in index.problems if f"{problem.name}/".startswith(f"{self.task}/")]
         if not index.entries and not faults:
             expected = "groups data/demo_<number>"
-            faults.append(str(PipelineError("holds no demonstration", where=self._file, expected=expected)))
+            faults.append(str(PipelineError("the file has no demonstration", where=self._file, expected=expected)))
         chosen = self._chosen(index.entries)
         reasons = self._replayed(chosen, self.replay)
         missing = [entry for entry, reason in reasons.items() if reason in MISSED]
@@ -136,7 +136,11 @@ class _FileJob:
 
     def _not_replayed(self, entry: DemoEntry, reason: str) -> str:
         expected = "a demonstration recorded with this LIBERO version, or with its model_file"
-        return str(PipelineError(f"not replayed ({reason})", where=self._place(entry), expected=expected))
+        return str(
+            PipelineError(
+                f"the demonstration cannot be replayed ({reason})", where=self._place(entry), expected=expected
+            )
+        )
 
     def _missing(self, entries: Sequence[DemoEntry], reasons: Mapping[DemoEntry, str]) -> Iterator[str]:
         """Report each demonstration of a file whose replays all miss, with dropped no-ops and settings that help."""
@@ -150,12 +154,12 @@ class _FileJob:
             remedy = f"set {'; or '.join(working)}"
         else:
             expected = "a demonstration that reaches the goal of its task's BDDL file from its first state"
-            remedy = "see that model_file, states and actions belong together, and that the task is the one recorded"
+            remedy = "check that model_file, states and actions belong together, and that the task is the recorded one"
         for entry in entries:
-            what = f"misses its goal, as do all that were replayed of this file ({reasons[entry]})"
+            what = f"the demonstration misses its goal, like all replayed ones of this file ({reasons[entry]})"
             dropped = self._dropped_noops(entry)
             if dropped:
-                what += f"; replay.noops: {self.replay.noops} left out {dropped} of its {entry.steps} actions"
+                what += f"; replay.noops: {self.replay.noops} leaves out {dropped} of its {entry.steps} actions"
             yield str(PipelineError(what, where=self._place(entry), expected=expected, remedy=remedy))
 
     def _dropped_noops(self, entry: DemoEntry) -> int:
@@ -173,9 +177,9 @@ class _FileJob:
         if steps:
             longest = max(steps, key=lambda entry: steps[entry])
             yield (
-                f"{self._place(longest)}: takes {steps[longest]} control steps, {len(steps)} of {len(entries)} "
-                f"demonstrations more than the {STEP_LIMITS[self.task.suite]} that an evaluation allows; `filter: "
-                "{exceeds_step_limit: drop}` drops such episodes"
+                f"{self._place(longest)}: takes {steps[longest]} control steps; {len(steps)} of {len(entries)} "
+                f"demonstrations take more than the {STEP_LIMITS[self.task.suite]} that an evaluation allows, and "
+                "`filter: {exceeds_step_limit: drop}` drops their episodes"
             )
 
     @property
@@ -193,7 +197,7 @@ class _FileJob:
         return 1800.0 + 4 * 600.0 * self.replays
 
     def lost(self) -> _Result:
-        return (), CheckedDemos(faults=[f"{self._file}: {LOST}, no worker reads it"])
+        return (), CheckedDemos(faults=[f"{self._file}: {LOST}, so no worker reads the file"])
 
 
 def _is_refused(reason: str) -> bool:

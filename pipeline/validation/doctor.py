@@ -84,7 +84,7 @@ def run(run: Run, *, tried: bool = False) -> int:
     """Print the results of ``check`` and of a trial for a configuration.
 
     Args:
-        tried: True if the trial was made before on this machine, which has not changed since.
+        tried: True if the trial has run before on this machine, which has not changed since.
 
     Returns:
         The exit status: 1 if a check fails, else 0.
@@ -108,7 +108,7 @@ def run(run: Run, *, tried: bool = False) -> int:
 
 
 def _tried(run: Run, tried: bool) -> list[Diagnosis]:
-    """Run the checks that take a trial, which is skipped if it was made before."""
+    """Run the checks that need a trial; the trial is skipped if it has run before."""
     try:
         speed = (machine.known_speed(run) if tried else None) or machine.trial().speed
     except PipelineError as error:
@@ -123,7 +123,7 @@ def _same(run: Run) -> Diagnosis:
         machine.refuse_another(run, machine.trial().digests)
     except PipelineError as error:
         return Diagnosis("same machine", "fail", error.what, error.remedy or "")
-    return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or nothing was made yet")
+    return Diagnosis("same machine", "ok", "ten steps and a frame equal those of the run, or the run has no output yet")
 
 
 def _finished(run: Run) -> Diagnosis:
@@ -131,19 +131,19 @@ def _finished(run: Run) -> Diagnosis:
     try:
         rows = plan_stage.upcoming(run)
     except PipelineError as error:
-        return Diagnosis("finished work", "warn", f"not known, as the run cannot be planned: {error.what}")
+        return Diagnosis("finished work", "warn", f"unknown, because the run cannot be planned: {error.what}")
     try:
         unneeded = dropped.measure(rows, run)
         reasons = outdated(rows, run.trajectories, run.frames, gl.choose().device)
     except PipelineError as error:
         return Diagnosis("finished work", "fail", f"{error.where}: {error.what}", error.remedy or "")
     if unneeded.asks:
-        remedy = "put the configuration back, give it another `name:`, or `REMAKE=1` before the command"
+        remedy = "restore the configuration, give it another `name:`, or put `REMAKE=1` before the command"
         return Diagnosis("finished work", "warn", f"no longer needed, and would be deleted: {unneeded}", remedy)
     if not reasons:
-        return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
+        return Diagnosis("finished work", "ok", "is kept, or does not exist yet")
     listed = "; ".join(f"{number} {reason}" for reason, number in reasons.items())
-    remedy = "go on where it was made, or `REMAKE=1` before the command"
+    remedy = "resume on the machine that generated it, or put `REMAKE=1` before the command"
     return Diagnosis("finished work", "warn", f"outdated: {listed}", remedy)
 
 
@@ -198,7 +198,7 @@ def _is_code(file: PackagePath) -> bool:
 def _tensorflow() -> Diagnosis:
     if find_spec("tensorflow") is not None:
         return Diagnosis("TensorFlow", "fail", "installed: it crashes processes in which Mesa renders", REINSTALL)
-    return Diagnosis("TensorFlow", "ok", "absent, as it must be")
+    return Diagnosis("TensorFlow", "ok", "not installed, as required")
 
 
 def _opengl() -> Diagnosis:
@@ -218,7 +218,7 @@ def _ffmpeg() -> Diagnosis:
     library = ctypes.util.find_library("avcodec")
     if library is not None:
         return Diagnosis("FFmpeg", "ok", library)
-    what = "no libavcodec: lerobot's torchcodec cannot read video"
+    what = "libavcodec is missing: lerobot's torchcodec cannot read video"
     return Diagnosis("FFmpeg", "warn", what, "apt-get install -y ffmpeg   (as root)")
 
 
@@ -229,7 +229,7 @@ def _assets() -> Diagnosis:
         return Diagnosis("LIBERO assets", "fail", f"{error.name} is not installed", REINSTALL)
     lost = [file for file in files if not Path(str(file.locate())).exists()]
     if lost:
-        return Diagnosis("LIBERO assets", "fail", f"{len(lost)} files are gone, such as {lost[0]}", REINSTALL)
+        return Diagnosis("LIBERO assets", "fail", f"{len(lost)} files are missing, such as {lost[0]}", REINSTALL)
     return Diagnosis("LIBERO assets", "ok", f"{len(ASSET_PACKAGES)} packages, {len(files)} files")
 
 
@@ -240,7 +240,7 @@ def _starter_demos() -> Diagnosis:
         return Diagnosis("starter demos", "fail", "robouse is not installed", REINSTALL)
     whole = [file for file in files if _as_packed(file)]
     if len(whole) != STARTER_DEMOS:
-        return Diagnosis("starter demos", "fail", f"{len(whole)} of {STARTER_DEMOS} are whole", REINSTALL)
+        return Diagnosis("starter demos", "fail", f"{len(whole)} of {STARTER_DEMOS} are undamaged", REINSTALL)
     return Diagnosis("starter demos", "ok", f"{STARTER_DEMOS}, with the hashes of their package")
 
 
@@ -257,14 +257,16 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     counts = {str(task): len(source.lengths(task)) for task in select_tasks(demos.tasks)}
     without = [name for name, count in counts.items() if not count]
     if without:
-        none = f"{len(without)} of {len(counts)} tasks have none under {root}, such as {without[0]}"
-        remedy = "set demos.root to the folder that holds the suites, and demos.tasks to the tasks that it has"
-        return Diagnosis("demos", "fail", none, f"get <suite>/<task>_demo.hdf5 of them; or {remedy}")
-    detail = f"{sum(counts.values())} in {len(counts)} tasks under {root}"
+        none = f"{len(without)} of {len(counts)} tasks have no demonstration under {root}, such as {without[0]}"
+        remedy = "set demos.root to the folder of the suites, and demos.tasks to the tasks that it has"
+        return Diagnosis("demos", "fail", none, f"get <suite>/<task>_demo.hdf5 of these tasks; or {remedy}")
+    detail = f"{sum(counts.values())} demonstrations of {len(counts)} tasks under {root}"
     few = [name for name, count in counts.items() if count < (demos.per_task or 1)]
     if few:
         short = f"{detail}; {len(few)} tasks have fewer than {demos.per_task}, such as {few[0]} with {counts[few[0]]}"
-        return Diagnosis("demos", "warn", short, "episodes of these have fewer different starts: add demonstrations")
+        return Diagnosis(
+            "demos", "warn", short, "add demonstrations: episodes of these tasks have fewer different starts"
+        )
     return Diagnosis("demos", "ok", detail)
 
 
@@ -289,9 +291,9 @@ def _download(name: str, file: Path, can_fetch: bool, tool: str, otherwise: Stat
     if file.is_file():
         return Diagnosis(name, "ok", "there")
     if can_fetch:
-        return Diagnosis(name, "ok", f"to be fetched by {tool} when a plan asks for it")
+        return Diagnosis(name, "ok", f"is fetched by {tool} when a plan needs it")
     return Diagnosis(
-        name, otherwise, f"not there, and no {tool} to fetch it with", f"put {file.name} into {file.parent}"
+        name, otherwise, f"missing, and there is no {tool} to fetch it", f"put {file.name} into {file.parent}"
     )
 
 
@@ -305,9 +307,11 @@ def _disk(run: Run, need_gb: float) -> Diagnosis:
     # Only a plan shows which datasets change, so the largest one counts.
     largest_mb = max(size_mb(run.path(kind.name)) for kind in FORMATS)
     if largest_mb:
-        detail += f", up to {largest_mb / 1e3:.1f} more where a dataset is made anew, as the old one stays until then"
+        detail += f", and up to {largest_mb / 1e3:.1f} GB more if a dataset is written again, next to the old one"
     if there_gb < need_gb:
-        return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
+        return Diagnosis(
+            "disk", "fail", detail, "free disk space, put the data folder on another disk, or request fewer episodes"
+        )
     return Diagnosis("disk", "ok", detail)
 
 

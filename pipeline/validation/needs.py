@@ -74,7 +74,7 @@ def needed_mb(config: Config) -> dict[str, float]:
     amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
     twins, _, twin_steps, mean_steps = amounts
     episodes, steps = _exported(config, amounts)
-    # Trajectories, and views of frames and of maps, that planned episodes do not share with their twins.
+    # Trajectories, and views of frames and of maps, that planned episodes do not share with their clean twins.
     trajectories = frames = maps = 0.0
     for number, kinds in _planned(config.plan):
         physics = any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
@@ -186,7 +186,7 @@ class Amounts(NamedTuple):
     Attributes:
         twins: number of clean twins.
         planned: number of planned episodes.
-        twin_steps: steps of all twins.
+        twin_steps: steps of all clean twins.
         mean_steps: mean steps of a planned episode; episodes are spread evenly over the tasks.
     """
 
@@ -223,7 +223,7 @@ def _casts_shadows(kind: type[Perturbation]) -> bool:
 
 
 def _seen_otherwise(kind: type[Perturbation]) -> bool:
-    """Return whether episodes have their own maps: they show other surfaces than the twin, or another viewpoint."""
+    """Return whether episodes have their own maps, because they show other surfaces or views than the clean twin."""
     return issubclass(kind, PhysicsPerturbation) or (issubclass(kind, RenderPerturbation) and kind.sees_otherwise)
 
 

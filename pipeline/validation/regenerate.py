@@ -53,10 +53,12 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     rows = {row["episode_id"]: row for row in manifest.read(manifest_file)}
     row = rows.get(episode_id)
     if row is None or not row["kept"]:
-        what = f"no kept episode {episode_id!r}" if row is None else f"{episode_id} was dropped: {row['reason']}"
+        what = (
+            f"there is no kept episode {episode_id!r}" if row is None else f"{episode_id} was dropped: {row['reason']}"
+        )
         raise PipelineError(what, where=manifest_file, expected="an episode_id whose row has kept = true")
     if out.exists() and any(out.iterdir()):
-        raise PipelineError("is not empty", where=out, remedy="name a new folder with --out")
+        raise PipelineError("the folder is not empty", where=out, remedy="name a new folder with --out")
     device = gl.choose().device
     rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), out, root)
     dataset = next(manifest_file.parent.glob(f"rlds/*/*/{row['rlds_shard']}"), None)
@@ -86,7 +88,9 @@ def _record(shard: Path, index: int) -> _Record:
     """Read an episode of a shard: the serialised example, and its columns."""
     data = record_at(shard, index)
     if data is None:
-        raise PipelineError(f"has no record {index}", where=shard, expected="as many as the manifest says")
+        raise PipelineError(
+            f"the shard has no record {index}", where=shard, expected="the records that the manifest names"
+        )
     return data, columns(data, tfds.builder_from_directory(shard.parent).info.features)
 
 
@@ -100,14 +104,14 @@ def _rebuild(
     """Generate the episode again below ``out``; return `None` and the reason if it is not kept this time."""
     if (settings.source == "hdf5") != (root is not None):
         raise PipelineError(
-            f"the run's demonstrations are of the source {settings.source}",
+            f"the run's demonstrations have the source {settings.source}",
             where="--demos",
             expected="the folder with <suite>/<task>_demo.hdf5 for hdf5, nothing for starter",
         )
     demos = DemosConfig(source=settings.source, root=root)
     if demos.open().load(row["demo_id"]).sha256 != row["demo_sha256"]:
         raise PipelineError(
-            "not the demonstration that the episode was made from",
+            "the demonstration is not the one that the episode was generated from",
             where=row["demo_id"],
             expected=f"content with the hash {row['demo_sha256']}",
         )
@@ -119,7 +123,7 @@ def _rebuild(
         return ReplayJob(each, planned_twin.trajectory_id, demos, settings.replay, trajectories)()
 
     if settings.replay.mode != "open_loop" and planned_twin.trajectory_id != planned.trajectory_id:
-        # Tracking follows the twin's trajectory.
+        # Tracking follows the clean twin's trajectory.
         replay(planned_twin)
     verdict = replay(planned)
     if not verdict.kept:
@@ -140,7 +144,7 @@ def _differences(stored: Mapping[str, NDArray[Any]], rebuilt: Mapping[str, NDArr
     differences = {}
     for name in sorted({*stored, *rebuilt}):
         if name not in stored or name not in rebuilt:
-            differences[name] = "only in the dataset" if name in stored else "only in what was rebuilt"
+            differences[name] = "only in the dataset" if name in stored else "only in the rebuilt episode"
             continue
         there, here = stored[name], rebuilt[name]
         off = [step for step, pair in enumerate(zip(there, here, strict=False)) if not np.array_equal(*pair)]

@@ -1,6 +1,6 @@
-"""Comparison of stored frames with new renderings of some episodes: is it the right picture, and the right way up?
+"""Comparison of stored frames with new renderings of some episodes, to find wrong or wrongly rotated frames.
 
-Another process than the one that rendered the frames renders them again, from the trajectory's states. Noise and
+A new process renders the frames again, from the trajectory's states. Noise and
 rotation are applied by code of this module, not by the run's (``rendering/render.py``).
 """
 
@@ -62,7 +62,7 @@ def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iter
                     yield case.finding(seen.dataset, what, right)
                 elif exact and seen.dataset == "frames":
                     what = f"{name} is another file than a fresh rendering, {reached_db:.1f} dB apart"
-                    expected = f"the same file, as both were rendered by {case.row['gl_device']}"
+                    expected = f"the same file, because {case.row['gl_device']} rendered both"
                     yield case.finding(seen.dataset, what, expected)
 
 

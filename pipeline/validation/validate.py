@@ -1,6 +1,6 @@
 """Validation of a finished run: its datasets and its manifest are opened again as their readers would open them.
 
-The datasets are compared with the stores that they were made from, and the stores with fresh renderings.
+The datasets are compared with the stores that they were generated from, and the stores with fresh renderings.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _counts(run: Run) -> Iterator[Fault]:
     """
     planned, rows = [row.episode_id for row in run.plan], run.manifest
     if planned != [row["episode_id"] for row in rows]:
-        yield Fault("manifest", None, f"{len(rows)} rows", f"the {len(planned)} of the plan, in its order")
+        yield Fault("manifest", None, f"{len(rows)} rows", f"the {len(planned)} rows of the plan, in its order")
     quotas = grouped(((row["axis"], row["suite"], row["task"]), row) for row in rows)
     for (axis, suite, task), members in quotas.items():
         wanted = sum(row["wanted"] for row in members)
@@ -162,7 +162,7 @@ def _counts(run: Run) -> Iterator[Fault]:
         if kept > wanted or (kept < wanted and left):
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
     if read_json(run.path(COUNTS)) != by_axis_and_suite(rows):
-        yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
+        yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts of the rows")
 
 
 def _as_a_whole(dataset: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:
@@ -184,7 +184,7 @@ def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> Results:
     except PipelineError as error:
         wrong = [str(error)]  # The reader stops at the first damaged file.
     results, name = Results(), folder.parent.name
-    faults = [Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in wrong]
+    faults = [Fault("rlds", None, f"{name}: {what}", "a dataset that OpenVLA-OFT can train on") for what in wrong]
     results.note("openvla_oft", faults)
     return results
 
@@ -251,7 +251,7 @@ class EpisodesJob:
             made = load(episode_id)
             trajectory = self.run.trajectories.load(row["trajectory_id"])
         except PipelineError as error:
-            results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])
+            results.note("stored", [Fault("frames", episode_id, str(error), "the output of the run")])
             return
         results.note("stored", [])
         if "outcome" in self.extras:  # The manifest has figures of kept episodes only.

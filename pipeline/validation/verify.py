@@ -57,7 +57,7 @@ def _gone(store: Store, there: Sequence[str]) -> list[list[str]]:
         listed = {str(row["file"]) for row in read_table(file, ["file"], MAKE_AGAIN).to_pylist()}
     except PipelineError as error:
         return [[str(error)]]
-    what = f"{file} lists it, and it is gone; `{MAKE_AGAIN}` makes it again"
+    what = f"{file} lists it, but it is missing; `{MAKE_AGAIN}` generates it again"
     return [[f"{store.path(name)}: {what}"] for name in sorted(listed - {*there})]
 
 

@@ -164,5 +164,5 @@ def test_any_other_field_is_refused() -> None:
     others = set(arrays()) - set(FIELDS)
     assert len(others) > 300
     for field in [*others, "vis", "nothing"]:
-        with pytest.raises(TypeError, match=rf"writes \['{field}'\], which pictures would not follow"):
+        with pytest.raises(TypeError, match=rf"writes \['{field}'\], which frames would not show"):
             writes(field)

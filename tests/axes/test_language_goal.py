@@ -90,9 +90,9 @@ def test_every_task_of_libero_demands_what_its_own_wording_tells(suite: str) -> 
         ),
         # Another receptacle or part.
         (SOUP, "put the alphabet soup in the drawer", "no word for the basket"),
-        (DRAWER, "open the top drawer of the cabinet", "which, middle"),
-        (SHUT, "put the black bowl in the top drawer of the cabinet and close it", "which, bottom"),
-        (CADDY, "put the book in the front compartment of the caddy", "which, back"),
+        (DRAWER, "open the top drawer of the cabinet", "part 'middle'"),
+        (SHUT, "put the black bowl in the top drawer of the cabinet and close it", "part 'bottom'"),
+        (CADDY, "put the book in the front compartment of the caddy", "part 'back'"),
         # Another thing, or one of two.
         (SOUP, "put the tomato sauce in the basket", "no word for the alphabet soup"),
         (TWO, "put the alphabet soup in the basket", "no word for the cream cheese"),
@@ -101,15 +101,15 @@ def test_every_task_of_libero_demands_what_its_own_wording_tells(suite: str) -> 
         (BESIDE, "put the black bowl on the plate", "relation 'next to' to the plate"),
         (BETWEEN, "put the black bowl beside the ramekin on the plate", "relation 'between'"),
         # The opposite, or nothing.
-        (DRAWER, "close the middle drawer of the cabinet", "say to open"),
-        (DRAWER, "i would like the middle drawer of the cabinet to be closed", "say to open"),
-        (INTO_DRAWER, "close the top drawer and put the bowl inside", "say to open"),
-        (MICROWAVE, "put the yellow and white mug in the microwave and open it", "say to close"),
-        (SHUT, "put the black bowl in the bottom drawer of the cabinet", "say to close"),
-        (STOVE, "turn off the stove", "say to turnon"),
-        (STOVE, "switch the stove off, please", "say to turnon"),
-        (BREW, "turn the stove off and put the moka pot on it", "say to turnon"),
-        (BREW, "put the moka pot on the stove", "say to turnon"),
+        (DRAWER, "close the middle drawer of the cabinet", "ask to open"),
+        (DRAWER, "i would like the middle drawer of the cabinet to be closed", "ask to open"),
+        (INTO_DRAWER, "close the top drawer and put the bowl inside", "ask to open"),
+        (MICROWAVE, "put the yellow and white mug in the microwave and open it", "ask to close"),
+        (SHUT, "put the black bowl in the bottom drawer of the cabinet", "ask to close"),
+        (STOVE, "turn off the stove", "ask to turnon"),
+        (STOVE, "switch the stove off, please", "ask to turnon"),
+        (BREW, "turn the stove off and put the moka pot on it", "ask to turnon"),
+        (BREW, "put the moka pot on the stove", "ask to turnon"),
         # Places changed.
         (MUGS, "put the white mug on the right plate and the yellow and white mug on the left plate", "change places"),
         (

@@ -292,7 +292,7 @@ def test_impossible_wishes_are_refused_with_their_reason(tmp_path: Path, base: S
 
 def test_an_object_that_is_another_now_is_refused(three: LayoutPerturbation, base: Scene, demo: Demo) -> None:
     stale = three.objects[0].model_copy(update={"sha256": "0" * 64})
-    with pytest.raises(PipelineError, match="not the one that was planned with"):
+    with pytest.raises(PipelineError, match="differs from the planned object"):
         LayoutPerturbation(level=1, objects=(stale,), seed=0).apply(base, demo, roll_out)
 
 

@@ -142,7 +142,7 @@ def test_without_the_package_the_error_names_it_and_what_works(folder: Path, mon
     monkeypatch.setenv("PATH", "")
     with pytest.raises(PipelineError, match="sweethome3d-furniture") as raised:
         models(("libero", "sweethome3d"))
-    assert "libero, robosuite and a folder work without it" in str(raised.value)
+    assert "libero, robosuite and a folder do not need it" in str(raised.value)
     assert [left.name for left in folder.iterdir()] == [".lock"]
 
 
@@ -319,20 +319,20 @@ def test_models_that_would_change_their_meaning_are_refused(geom: str, tmp_path:
     file = tmp_path / "model.xml"
     file.write_text(f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>")
     mujoco.MjModel.from_xml_path(str(file))
-    with pytest.raises(PipelineError, match="no quat"):
+    with pytest.raises(PipelineError, match="other than quat"):
         _ = ObjectModel("own/x", "x", "", "", file).shape
 
 
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        (None, "", r"mine: there are no models here(?s:.*)<category>/<name>\.obj"),
+        (None, "", r"mine: the folder has no models(?s:.*)<category>/<name>\.obj"),
         ("can_of_soda/x.obj", HOUSE.replace("5", "0.05").replace("20", "0.2"), "can_of_soda"),
-        ("Cube/x.obj", HOUSE, "'Cube' is no category"),
+        ("Cube/x.obj", HOUSE, "'Cube' is not a category"),
         ("dot/dot.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", r"dot\.obj"),
         ("house/house.obj", HOUSE, r"house\.obj: the model measures 20 m(?s:.*)at most 0\.5 m"),
         ("cube/x.xml", "<mujoco", r"x\.xml"),
-        ("cube/x.xml", "<mujoco><worldbody/></mujoco>", r"x\.xml: .*nothing to touch"),
+        ("cube/x.xml", "<mujoco><worldbody/></mujoco>", r"x\.xml: .*no collision geometry"),
         ("cube/x.xml", TWISTED, r"mine/cube/x\.xml: MuJoCo cannot use the model"),
         ("cube/x.xml", BEREFT, r"mine/cube/x\.xml: MuJoCo cannot use the model(?s:.*)lost\.obj"),
     ],

@@ -198,7 +198,9 @@ def test_check_catches_statistics_of_something_else(data: Path, statistics: dict
     assert found["statistics_difference"] == pytest.approx(1e-6)
     assert len(found["violations"]) == 1
     off["proprio"]["q99"][3] = float("nan")
-    assert oft.check(folder, {NAME: off})["violations"] == ["dataset_statistics.json is off by up to inf"]
+    assert oft.check(folder, {NAME: off})["violations"] == [
+        "dataset_statistics.json differs from the data by up to inf"
+    ]
     assert oft.check(folder, {NAME: statistics | {"num_trajectories": 4}})["statistics_difference"] == 1
 
 
@@ -221,4 +223,4 @@ def test_errors_say_what_is_missing(data: Path, tmp_path: Path) -> None:
         check_all(tmp_path)
     (tmp_path / "dataset_statistics.json").write_text("{}")
     (found,) = check_all(tmp_path).values()
-    assert found["violations"] == ["dataset_statistics.json has nothing on it"]
+    assert found["violations"] == ["dataset_statistics.json lacks this dataset"]

@@ -159,7 +159,7 @@ def test_results_of_other_versions_are_made_again_where_that_is_asked_for(
     number = identity.RECIPES["evaluation"]
     next_recipe()
     monkeypatch.delenv(identity.REMAKE, raising=False)
-    told = f"1 episodes, made with recipe of evaluation {number}, here {number + 1}"
+    told = f"1 episodes, generated with recipe of evaluation {number}, here {number + 1}"
     with pytest.raises(PipelineError, match=rf"{told}(?s:.*)REMAKE=1"):
         run(out, checkpoint)
     assert len(taken) == STEPS, "it says so before anything is run"
@@ -255,7 +255,7 @@ def test_a_perturbation_that_is_drawn_otherwise_now_is_run_again(
     assert select(chosen) == tasks
     changed = sum(replayed.result(task) is None for task in tasks)
     assert 0 < changed < len(tasks), "of one component alone"
-    with pytest.raises(PipelineError, match=rf"anew: {changed} episodes, made with other draws\n"):
+    with pytest.raises(PipelineError, match=rf"anew: {changed} episodes, generated with other draws\n"):
         replayed.check(tasks)
 
 
@@ -277,7 +277,7 @@ def test_a_folder_has_frames_of_one_device(tmp_path: Path) -> None:
     replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
     versions = replayed.versions(task) | {"OpenGL": "another GPU"}
     EpisodeFiles(tmp_path).save(result(task, episode=replayed.episode(task), versions=versions))
-    with pytest.raises(PipelineError, match=r"1 episodes, made with OpenGL another GPU, here (?s:.*)REMAKE=1"):
+    with pytest.raises(PipelineError, match=r"1 episodes, generated with OpenGL another GPU, here (?s:.*)REMAKE=1"):
         replayed.check([task])
 
 
@@ -288,7 +288,7 @@ def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
     file.parent.mkdir()
     file.write_text(json.dumps(old))
     for use in (lambda: results.read([tmp_path]), lambda: run(tmp_path, checkpoints.save(tmp_path / "policy", 0.1))):
-        with pytest.raises(PipelineError, match="not a result as this version writes it") as caught:
+        with pytest.raises(PipelineError, match="not a result of this version") as caught:
             use()
         assert "a.json" in str(caught.value)
         assert "another folder" in str(caught.value)
@@ -340,7 +340,7 @@ def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path)
     [
         ([EvaluationTask("libero_plus", STOVE.suite, STOVE.name, "a", "camera", "", 1, 0)], "libero_plus never start"),
         ([EvaluationTask("goals", STOVE.suite, STOVE.name, "a", "goal", "", 0, 0)], "goals never start"),
-        ([libero_task(STOVE, 0), libero_task(STOVE, 1)], "2 episodes of libero_goal/.* would be the same"),
+        ([libero_task(STOVE, 0), libero_task(STOVE, 1)], "2 episodes of libero_goal/.* would be equal"),
     ],
     ids=["test tasks", "goals", "libero"],
 )

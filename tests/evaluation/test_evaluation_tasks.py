@@ -225,7 +225,7 @@ def test_tasks_of_unknown_level_are_counted_where_a_level_is_asked_for(capsys: p
     chosen = select(Selection(source="libero_plus", levels=(1, 2, 3, 4, 5)))
     counts = Counter(task.axis for task in chosen)
     assert counts == {"camera": 1599, "robot": 1550, "noise": 1601, "language": 1537, "pose": 696}
-    assert "left out, because the parameters do not tell their level (0): background 1076, light 1142" in (
+    assert "left out, because their parameters do not state their level (0): background 1076, light 1142" in (
         capsys.readouterr().out
     )
     select(Selection(source="libero_plus", axes=("background",), levels=(0,)))

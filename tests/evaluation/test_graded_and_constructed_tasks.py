@@ -94,12 +94,12 @@ def test_a_list_is_of_the_draws_that_it_was_made_with(tmp_path: Path, monkeypatc
     assert select(Selection(file=file)) == drawn
     ranges = CameraAxis(spherical=SphericalRange(elevation_deg=((0.0, 1.0),)))
     monkeypatch.setattr(own_draws, "held_out", lambda _: ranges)
-    with pytest.raises(PipelineError, match="this version draws other perturbations"):
+    with pytest.raises(PipelineError, match="this version samples other perturbations"):
         select(Selection(file=file))
 
 
 def test_a_benchmark_is_filtered_by_results_of_its_own_seed() -> None:
     candidate = EvaluationTask("own", STOVE.suite, STOVE.name, "a", "robot", "initial_joints", 1, 0)
-    with pytest.raises(PipelineError, match=r"a result of seed 0(?s:.*)expected: seed 3"):
+    with pytest.raises(PipelineError, match=r"the result has seed 0(?s:.*)expected: seed 3"):
         construct([candidate], 3, 1, [result(candidate, reason="refused")])
     assert construct([candidate], 3, 1, [result(candidate, reason="refused", seed=3)])[0] == []

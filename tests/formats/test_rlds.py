@@ -122,7 +122,7 @@ def test_a_set_with_an_episode_too_many_or_a_foreign_shard_is_found(tmp_path: Pa
     places = {name: {**place, "demo_id": name} for name, place in target.record().places.items()}
     assert list(target.check(places, tmp_path)) == []
     ((check, fault),) = target.check({one: places[one] for one in IDS[1:]}, tmp_path)
-    assert (check, fault.what) == ("ids", "has 6 episodes, foreign ones or some twice")
+    assert (check, fault.what) == ("ids", "has 6 episodes, of which some are foreign or repeated")
     (shard, *_) = sorted(target.folder.rglob("*.tfrecord-*"))
     shutil.copy(shard, shard.with_name(f"{SET}-train.tfrecord-00003-of-00003"))
     assert ("format", True) in [

@@ -66,7 +66,7 @@ def test_all_that_was_made_from_one_demonstration_is_on_one_side(episodes: Episo
         sides = [{origins[one] for one in ids} for ids in splits.values()]
         assert sorted(map(len, sides)) == [1, 1]
         assert not sides[0] & sides[1]
-    with pytest.raises(PipelineError, match="made from one count as one"):
+    with pytest.raises(PipelineError, match="expansions of one demonstration count as one"):
         Episodes({one: value._replace(origin="a") for one, value in known.items()}, episode).by_split(0.5)
 
 

@@ -110,7 +110,7 @@ def test_a_byte_order_mark_is_named(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(PipelineError, match=r"gone\.bddl: cannot be read"):
+    with pytest.raises(PipelineError, match=r"gone\.bddl: the file cannot be read"):
         bddl.read(tmp_path / "gone.bddl")
 
 

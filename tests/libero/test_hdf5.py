@@ -120,7 +120,7 @@ def test_an_exact_copy_is_left_out_and_both_are_named(root: Path, model_file: st
     assert [entry.key for entry in index.entries if entry.task == other] == ["demo_1"]
     assert [problem.name for problem in index.problems] == [f"{NAME}/demo_2", f"{other.suite}/{other.name}/demo_0"]
     for problem in index.problems:
-        assert f"the same actions, states and model as {NAME}/demo_1" in str(problem.error)
+        assert f"has the actions, states and model of {NAME}/demo_1" in str(problem.error)
         assert f"data/{problem.name.rpartition('/')[2]}" in str(problem.error)
     assert len(HDF5Source(root).index([TASK], per_task=3).entries) == 3
 

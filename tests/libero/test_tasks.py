@@ -56,7 +56,7 @@ def test_own_tasks_stand_beside_liberos(tmp_path: Path, monkeypatch: pytest.Monk
         find_task("my_suite", "bowl_up")
     for name in ("My suite", "goal", "libero_mine", "mine_val", "val", "my_aloha"):
         own_task(tmp_path / "tasks" / name)
-        with pytest.raises(PipelineError, match=f"a suite cannot be called '{name}'"):
+        with pytest.raises(PipelineError, match=f"a suite cannot have the name '{name}'"):
             suites()
         shutil.rmtree(tmp_path / "tasks" / name)
 

@@ -26,7 +26,7 @@ def test_levels_that_are_in_the_test_set_are_named(levels: tuple[int, ...], name
     if named is None:
         assert {row.level for row in plan.make(entries, config, ReplayConfig(), test) if row.axis == "noise"} == {"5"}
         return
-    told = f"noise.gaussian_blur: gaussian_blur has test tasks as strong as the level {named}\n"
+    told = f"noise.gaussian_blur: gaussian_blur has test tasks as strong as level {named}\n"
     with pytest.raises(PipelineError, match=told):
         plan.make(entries, config, ReplayConfig(), test)
     with pytest.raises(PipelineError, match=told):

@@ -76,7 +76,7 @@ def test_a_scene_that_shares_no_context_is_drawn_plainly(caplog: pytest.LogCaptu
     with closing(Renderer(endless)) as renderer:
         assert type(renderer.drawing) is PlainDrawing
     (record,) = caplog.records
-    assert "a floor without bounds" in record.getMessage()
+    assert "an unbounded floor" in record.getMessage()
 
 
 def test_other_pixels_of_the_small_scene_draw_plainly(

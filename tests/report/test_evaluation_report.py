@@ -151,7 +151,7 @@ def test_results_under_different_prompts_or_limits_are_not_compared(
     for command in ("grade", "report"):
         assert analyze(command, *out) == 1
         told = capsys.readouterr().err
-        assert f"cannot be compared, on {subset[0].source}/{subset[0].suite}: {field} " in told
+        assert f"cannot be compared on {subset[0].source}/{subset[0].suite}: {field} " in told
         assert f"{getattr(one, field)} and {getattr(other, field)}" in told
         for folder, row in zip(folders, (one, other), strict=True):
             assert str(EpisodeFiles(folder).path(row.episode)) in told

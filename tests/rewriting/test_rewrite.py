@@ -238,7 +238,7 @@ def test_busy_and_broken_endpoints_are_asked_again(server: Server, tmp_path: Pat
         (status(200, b"x" * (language_model.MAX_ANSWER_BYTES + 1)), "more than"),
         (says('["put plate_1 on stove_1"]'), "file-name debris"),
         (says('["turn on the stove."]'), "equal to the original"),
-        (says('["turn the stove off, please"]'), "does not say to turnon"),
+        (says('["turn the stove off, please"]'), "does not ask to turnon"),
         (says('["switch on the microwave oven"]'), "has no word for the flat stove"),
         (says(f'["{load_bank()[STOVE.suite][STOVE.name]["paraphrase"][0]}"]'), "a repetition"),
     ],

@@ -78,4 +78,4 @@ def test_demos_check_names_it(replayed: tuple[Row, TrajectoryStore], tmp_path: P
     file = tmp_path / WINE.suite / f"{WINE.name}_demo.hdf5"
     hdf5.write(file, WINE, [recording])
     (note,) = check(tmp_path, 0, loop).notes
-    assert note.startswith(f"{file} data/demo_0: takes 347 control steps, 1 of 1 demonstrations more than the 300")
+    assert note.startswith(f"{file} data/demo_0: takes 347 control steps; 1 of 1 demonstrations take more than the 300")

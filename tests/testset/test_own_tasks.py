@@ -86,9 +86,9 @@ def test_own_tasks_in_liberos_scenes_and_in_own_scenes_are_planned(
 def test_a_test_tasks_file_under_its_own_name_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     own_task(BOWL.bddl_file.read_text(), tmp_path)
-    with pytest.raises(PipelineError, match=f"is called as a test task of LIBERO-Plus, which perturbs {BASE}"):
+    with pytest.raises(PipelineError, match=f"has the name of a test task of LIBERO-Plus, which perturbs {BASE}"):
         own_task(BOWL.bddl_file.read_text(), tmp_path, f"{BASE}_view_0_0_100_0_0_initstate_7")
-    with pytest.raises(PipelineError, match="is called as a test task"):
+    with pytest.raises(PipelineError, match="has the name of a test task"):
         tasks("my_suite")
 
 

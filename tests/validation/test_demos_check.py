@@ -65,7 +65,7 @@ def test_a_file_of_which_all_miss_is_a_fault(root: Path) -> None:
         del file["data/demo_0"]
     file_of(root, BOWL).unlink()
     (fault,) = checked(root, replays=2).faults
-    assert fault.startswith(f"{file_of(root, STOVE)} data/demo_1: misses its goal, as do all")
+    assert fault.startswith(f"{file_of(root, STOVE)} data/demo_1: the demonstration misses its goal, like all")
     assert "(goal_not_reached)" in fault
 
 
@@ -75,7 +75,9 @@ def test_a_scene_of_another_task_cannot_be_replayed(root: Path, whole: dict[Task
         del file["data/demo_0/states"], file["data/demo_0"].attrs["init_state"]
         file["data/demo_0/states"] = states
     (fault,) = checked(root, replays=2).faults
-    assert fault.startswith(f"{file_of(root, STOVE)} data/demo_0: not replayed (state_mismatch)")
+    assert fault.startswith(
+        f"{file_of(root, STOVE)} data/demo_0: the demonstration cannot be replayed (state_mismatch)"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +103,7 @@ def test_dropped_waits_are_counted_and_the_settings_that_work_are_named(waiting:
     """The first of the 15 resting steps closes the gripper and is no no-op."""
     (fault,) = checked(waiting, 1, mode="open_loop").faults
     assert "misses its goal" in fault
-    assert "replay.noops: drop left out 14 of its 93 actions" in fault
+    assert "replay.noops: drop leaves out 14 of its 93 actions" in fault
     assert "try: set replay.noops: keep and replay.mode: open_loop (1 of 1 reach the goal)" in fault
     assert "LIBERO version" not in fault
 
@@ -121,7 +123,7 @@ def test_a_file_without_demonstrations_is_a_fault(root: Path) -> None:
     with h5py.File(file_of(root, STOVE), "r+") as file:
         del file["data/demo_0"], file["data/demo_1"]
     (fault,) = checked(root).faults
-    assert fault.startswith(f"{file_of(root, STOVE)}: holds no demonstration")
+    assert fault.startswith(f"{file_of(root, STOVE)}: the file has no demonstration")
 
 
 def test_what_is_ignored_or_limited_is_noted(root: Path) -> None:
@@ -159,7 +161,7 @@ def test_long_instructions_and_test_tasks_of_ones_own(root: Path, monkeypatch: p
     (note,), (fault,) = found.notes, found.faults
     assert note.startswith("my_suite/long: the instruction has 44 words and marks")
     assert "SmolVLA and pi0 read 48 tokens" in note
-    assert "tested.bddl: has the scene of LIBERO-Plus's test task libero_goal/" in fault
+    assert "tested.bddl: the task has the scene of LIBERO-Plus's test task libero_goal/" in fault
     (warning,) = doctor._instructions(DemosConfig(root=Path("own"), tasks=("my_suite/long",)))
     assert warning.status == "warn"
 
@@ -179,11 +181,11 @@ def test_damage_copies_and_strange_names_are_named(root: Path) -> None:
     assert (found.files, found.demonstrations) == (4, 1)
     told = "\n".join(found.faults)
     assert len(found.faults) == 5, told
-    assert f"{stove}: not readable as HDF5" in told
+    assert f"{stove}: the file is not readable as HDF5" in told
     assert f"{bowl} data/demo_1: actions or states hold NaN" in told
-    assert f"{bowl} data/demo_7: holds the same actions, states and model as {BOWL.suite}/{BOWL.name}/demo_0" in told
+    assert f"{bowl} data/demo_7: has the actions, states and model of {BOWL.suite}/{BOWL.name}/demo_0" in told
     assert "turn_of_the_stove_demo.hdf5: libero_goal has no task 'turn_of_the_stove'" in told
-    assert f"{root / 'loose.hdf5'}: is not where a run looks" in told
+    assert f"{root / 'loose.hdf5'}: no run reads this file" in told
 
 
 def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +238,9 @@ def test_two_files_with_one_demonstration_are_named(root: Path) -> None:
         file["data"].attrs["bddl_file_name"] = f"x/{STOVE.name}.bddl"
     faults = checked(root).faults
     assert len(faults) == 2
-    assert faults[0].startswith(f"{STOVE.suite}/{STOVE.name}/demo_0: holds the same as {BOWL.suite}/{BOWL.name}/demo_0")
+    assert faults[0].startswith(
+        f"{STOVE.suite}/{STOVE.name}/demo_0: has the content of {BOWL.suite}/{BOWL.name}/demo_0"
+    )
 
 
 def test_an_empty_folder_says_what_belongs_there(tmp_path: Path) -> None:

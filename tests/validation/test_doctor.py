@@ -187,7 +187,7 @@ def test_demonstrations_must_be_where_the_configuration_says(short_demos: Path, 
     assert "demos" in failures(tmp_path, demos=demos), "it holds nothing"
     shutil.copy(short_demos / file.relative_to(tmp_path / "demos"), file)
     assert (
-        f"1 of 2 tasks have none under {demos.root}, such as {names[1]}"
+        f"1 of 2 tasks have no demonstration under {demos.root}, such as {names[1]}"
         in failures(tmp_path, demos=demos)["demos"].detail
     )
     fewer = demos.model_copy(update={"tasks": names[:1], "per_task": 2})
@@ -203,7 +203,7 @@ def test_starter_demonstrations_have_the_hashes_of_their_package(
 ) -> None:
     read = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: b"" if path.name == "demo_actions.json" else read(path))
-    assert failures(tmp_path)["starter demos"].detail == "0 of 130 are whole"
+    assert failures(tmp_path)["starter demos"].detail == "0 of 130 are undamaged"
 
 
 @pytest.mark.parametrize("package", ["mujoco", "opencv-python-headless"])

@@ -113,10 +113,10 @@ def test_refuses_what_cannot_be_made(copy: Path, short_demos: Path, tmp_path: Pa
         regenerate("none", file, out, short_demos)
     with pytest.raises(PipelineError, match="was dropped: goal_not_reached"):
         regenerate(dropped, file, out, short_demos)
-    with pytest.raises(PipelineError, match="demonstrations are of the source hdf5"):
+    with pytest.raises(PipelineError, match="demonstrations have the source hdf5"):
         regenerate(made, file, out)
     changed(copy, {"demo_sha256": "0" * 64})
-    with pytest.raises(PipelineError, match="not the demonstration that the episode was made from"):
+    with pytest.raises(PipelineError, match="not the one that the episode was generated from"):
         regenerate(made, file, out, short_demos)
     write_table(pq.read_table(file).drop_columns("level"), tmp_path / "older.parquet")
     with pytest.raises(PipelineError, match="lacks the columns level"):

@@ -88,7 +88,12 @@ def test_a_rewrite_of_ones_own(text: str, named: str | None, tmp_path: Path) -> 
 
 def test_a_gripper_between_open_and_closed(tmp_path: Path) -> None:
     file = tmp_path / BOWL.suite / f"{BOWL.name}_demo.hdf5"
-    for gripper, told in ((-1.0, None), (1.0, None), (0.2, "the gripper is told 0.2"), (0.0, "the gripper is told 0")):
+    for gripper, told in (
+        (-1.0, None),
+        (1.0, None),
+        (0.2, "the gripper has the command 0.2"),
+        (0.0, "the gripper has the command 0"),
+    ):
         recorded(file, gripper)
         faults = [
             str(problem.error)

@@ -286,7 +286,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         actions = self.keys["action"]
         return f"""\
-The repository is laid out as the folder that `finetune/` expects, here `$DATA`. Each folder below `{self.name}/` is a
+The repository has the layout that `finetune/` expects of the folder `$DATA`. Each folder below `{self.name}/` is a
 dataset in the convention `{self.options.convention}`, with the actions as `{actions}`:
 
 ```sh

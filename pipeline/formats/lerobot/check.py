@@ -105,14 +105,14 @@ def check(
     for what, expected in wrong:
         yield "format", Fault("lerobot", None, what, expected)
     for episode_id, key in samples:
-        yield "format", Fault("lerobot", episode_id, f"lerobot reads another {key}", "what its files hold")
+        yield "format", Fault("lerobot", episode_id, f"lerobot reads another {key}", "the content of its files")
     wanted_steps = sum(row["steps"] for row in kept.values())
     if stored != (len(kept), wanted_steps):
         size = f"{stored[0]} episodes of {stored[1]} steps"
         yield "ids", Fault("lerobot", None, size, f"{len(kept)} of {wanted_steps}")
     # Reading the episodes reports missing ones.
     for episode_id in sorted(episodes.keys() - kept.keys()):
-        yield "ids", Fault("lerobot", episode_id, "is in the dataset", "kept episodes alone")
+        yield "ids", Fault("lerobot", episode_id, "is in the dataset", "only kept episodes")
     yield from in_both_splits("lerobot", split_of, kept)
 
 
@@ -141,7 +141,7 @@ def _format(
     yield from unlike("lerobot", info["features"], _as_json(convention.described(extras)))
     unexpected = sorted(info["features"].keys() - convention.columns(extras).keys())
     if unexpected:
-        yield Fault("lerobot", None, f"columns {unexpected} are described", "those of the data files")
+        yield Fault("lerobot", None, f"info.json describes the columns {unexpected}", "only columns of the data files")
     yield from _wrong_tasks("lerobot", tasks, [row["tasks"][0] for row in episodes.values()])
     yield from _wrong_splits(info["splits"], len(episodes), val)
     yield from _wrong_modality("lerobot", root, info["features"], convention)
@@ -182,7 +182,7 @@ def _split_of(root: Path, episodes: Mapping[str, Mapping[str, Any]]) -> dict[str
 
 
 def _wrong_files(root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention) -> Iterator[Fault]:
-    """Compare the existing files with those that the episodes name."""
+    """Compare the existing files with the files that the episodes name."""
     kinds = {"data": ".parquet", "meta/episodes": ".parquet"}
     if convention.frames == "video":
         kinds |= {f"videos/{view.lerobot_key}": ".mp4" for view in SCHEMA.views.values()}
@@ -290,10 +290,10 @@ def check_v21(
         yield "ids", Fault(dataset, None, f"{len(split_of)} episodes", f"{len(kept)}")
     # Reading the episodes reports missing ones.
     for episode_id in split_of.keys() - kept.keys():
-        yield "ids", Fault(dataset, episode_id, "is in the dataset", "kept episodes alone")
+        yield "ids", Fault(dataset, episode_id, "is in the dataset", "only kept episodes")
     splits, wanted = set(split_of.values()), {"train", "val"} if validation else {"train"}
     if splits != wanted:
-        yield "format", Fault(dataset, None, f"the sets are for {sorted(splits)}", f"{sorted(wanted)}")
+        yield "format", Fault(dataset, None, f"the sets have the splits {sorted(splits)}", f"{sorted(wanted)}")
     yield from in_both_splits(dataset, split_of, kept)
 
 
@@ -475,5 +475,5 @@ def _wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[An
             least, most = episodes[name].min(axis=0), episodes[name].max(axis=0)
         if not ((levels >= least - SAME) & (levels <= most + SAME)).all():
             statement = f"{name} of {column} is {levels.tolist()} in the statistics"
-            yield statement, f"from {least.tolist()} to {most.tolist()}, as follows from those of the episodes"
+            yield statement, f"from {least.tolist()} to {most.tolist()}, by the statistics of the episodes"
     yield from disordered(column, stored)

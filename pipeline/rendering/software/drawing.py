@@ -85,7 +85,7 @@ class Still:
 
 
 class SoftwareDrawing(PlainDrawing):
-    """Drawing of models that are ``possible``, with all savings.
+    """Rendering of models that are ``possible``, with all savings.
 
     Attributes:
         chooses_faces: True renders large meshes by the faces that cover a sample; False renders all meshes whole.
@@ -112,7 +112,7 @@ class SoftwareDrawing(PlainDrawing):
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
-        """Return whether this drawing can render a model, which must not need its own context.
+        """Return whether this class can render a model, which must not need its own context.
 
         A model needs its own context for height fields, skins, planes without bounds, or a number of samples other than
         ``SAMPLES``. LIBERO's models have none of these.

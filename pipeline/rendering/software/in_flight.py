@@ -85,7 +85,7 @@ class PixelBuffers:
 
 
 class InFlightDrawing(PlainDrawing):
-    """Plain drawing whose frames are in flight between ``start_frame`` and the wait for them.
+    """Plain rendering whose frames are in flight between ``start_frame`` and the wait for them.
 
     Raises:
         PipelineError: if this machine cannot render, or OpenGL reports an error.

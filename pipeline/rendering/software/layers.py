@@ -9,7 +9,7 @@ from pipeline.rendering.software.in_flight import InFlightDrawing
 
 
 class LayersDrawing(InFlightDrawing, SoftwareDrawing):
-    """Drawing with frames in flight, culling and underlays, of models that are ``possible``.
+    """Rendering with frames in flight, culling and underlays, of models that are ``possible``.
 
     Raises:
         PipelineError: if OpenGL reports an error.
