@@ -92,8 +92,8 @@ class CoveragePlots(NamedTuple):
 
 
 Measures = Iterable[tuple[str, float]]
-"""Names of visible effects, with their units, and one value each. The report has the percentiles of each name's values,
-and the share of truth values."""
+"""Names of visible effects, with their units, and one value each. The report has percentiles of numbers and shares of
+truth values."""
 
 
 class ObservedEpisode(Protocol):
@@ -119,7 +119,10 @@ class ObservedEpisode(Protocol):
         """Return the state after ``step`` executed actions."""
 
     def twin_look(self, step: int = 0) -> Look | None:
-        """Return the clean twin's state after ``step`` executed actions, or ``None`` without a twin."""
+        """Return the clean twin's state after ``step`` executed actions, or ``None`` without a clean twin."""
 
     def changes(self) -> Mapping[str, Floats]:
-        """Return absolute differences of the first frame from the twin's, (H, W, 3), by view; empty without a twin."""
+        """Return absolute differences of the first frame from the clean twin's, (H, W, 3), by view.
+
+        The result is empty without a clean twin.
+        """

@@ -31,7 +31,7 @@ def plot_axis(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -
 
 
 def _distances(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet, unit: str) -> Panel:
-    """Plot the distance from each test task to the nearest perturbation.
+    """Plot the distance from each test task to the nearest perturbation of a kept episode.
 
     Test tasks that cannot be compared with any perturbation are left out.
     """
@@ -41,4 +41,4 @@ def _distances(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet, 
     for component in dict.fromkeys(components.tolist()):
         comparable = (components == component) & np.isfinite(least)
         rows[component.replace("_", " ")] = {axis: least[comparable]}
-    return figures.strips("from each test task to the nearest draw", rows, unit)
+    return figures.strips("Distance from each test task to the nearest kept episode", rows, unit)
