@@ -229,7 +229,7 @@ def _changes(change: Perturbation, shown: AnyFormat) -> str:
     if change.layer == Layer.TEXT:
         return "the instruction"
     views = " and ".join(f"`{shown.keys[view]}`" for view in SCHEMA.views if view in change.views)
-    return f"{views}, state and length" if change.layer == Layer.PHYSICS else views
+    return f"{views}, the states and the length" if change.layer == Layer.PHYSICS else views
 
 
 def _yields(rows: Sequence[Mapping[str, Any]]) -> list[list[object]]:

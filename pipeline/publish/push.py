@@ -45,7 +45,7 @@ class Upload:
         dataset: path in the repository to local file, for the files of the dataset.
         others: path in the repository to local file, for all other files.
         sha256: path in the repository to the recorded checksum.
-        folders: top folders of the repository in which only the dataset may lie.
+        folders: top folders of the repository that may contain only the dataset.
         tag: name that the commit gets, if a client's loader asks for it.
     """
 
@@ -119,7 +119,7 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
     """Read the repository on the hub, and list the files that an upload would delete there; nothing is sent.
 
     Returns:
-        Words: the state of the repository, and every file that would be deleted.
+        A description of the repository, and of every file that would be deleted.
 
     Raises:
         PipelineError: if the repository has files of another origin, or a file here has changed.
@@ -135,7 +135,12 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
     _, new = _contents(upload, name)
     gone = _deleted(there, new, upload.folders, private=private, replace=replace)
     kind = "private" if there.private else "public"
-    return "\n".join([f"{name} ({kind}) has {len(there.files)} files; deleted: {len(gone)}", *(f"  {x}" for x in gone)])
+    return "\n".join(
+        [
+            f"{name} ({kind}) has {len(there.files)} files; the upload would delete {len(gone)}",
+            *(f"  {x}" for x in gone),
+        ]
+    )
 
 
 def send(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
@@ -188,7 +193,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             parent_commit=there.commit,
         )
         _refuse_other_content(files_of(api, repository, str(commit.oid)), sent, repository)
-        if upload.tag is not None:  # an earlier upload may have the tag, which moves
+        if upload.tag is not None:  # An earlier upload may have the tag, which then moves.
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
             api.create_tag(repository, tag=upload.tag, repo_type="dataset")
@@ -272,7 +277,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
 
 
 def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
-    """Raise an error unless exactly these files passed validation, and there is a card.
+    """Raise an error unless exactly these files passed validation, and the card exists.
 
     The content of the report that the card was generated from is compared in ``prepare``.
     """

@@ -233,7 +233,7 @@ def test_another_dataset_stays_until_it_is_to_be_replaced(
 
     told = compare(upload, REPOSITORY, replace=True).splitlines()
     gone = before.keys() - upload.files.keys() - {UPLOAD, ".gitattributes"}
-    assert told == [f"{REPOSITORY} (public) has {len(before) - 1} files; deleted: {len(gone)}"] + [
+    assert told == [f"{REPOSITORY} (public) has {len(before) - 1} files; the upload would delete {len(gone)}"] + [
         f"  {path}" for path in sorted(gone)
     ]
     assert hub.files == before
