@@ -214,7 +214,7 @@ def _test_places_m(tested: TestTask) -> Floats:
 def _measures(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:
     """Measure a scene with added objects, by their models and their places (N, 2) in the frame of the surface."""
     for number in range(1, 6):
-        yield f"scenes with {number} added objects", len(models) == number
+        yield f"scenes with {number} added object{'s' * (number > 1)}", len(models) == number
     if len(models) > 1:
         yield f"scenes with {len(models)} added objects and a repeated model", len(set(models)) < len(models)
     x_m, z_m = ARENAS[arena].camera_xz_m

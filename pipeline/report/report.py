@@ -187,7 +187,7 @@ def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
         for made in from_json(row["perturbations"]):
             drawn_on.setdefault(made.axis, []).append((row, made))
     for axis, of_axis in drawn_on.items():
-        table = yields.by_level("Kept/planned episodes, by component and level", [row for row, _ in of_axis], axis)
+        table = yields.by_level("Kept/planned episodes, by component", [row for row, _ in of_axis], axis)
         kept = []
         for row, made in of_axis:
             if row["kept"]:
