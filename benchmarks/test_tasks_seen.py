@@ -81,14 +81,15 @@ def _frames(simulator: Simulator, arena: str) -> Iterator[tuple[str, float]]:
         surface_geoms = [geom for geom, body in enumerate(bodies) if body.endswith(surface)]
         wall_geoms = [geom for geom, material in enumerate(materials) if material in WALLS]
         on_surface, around = np.isin(geoms, surface_geoms), np.isin(geoms, wall_geoms)
-        yield f"background: share of {view} that surface changes", float(on_surface.mean())
-        yield f"background: share of {view} that theme changes", float((on_surface | around).mean())
+        yield f"background: share of {view} changed by surface", float(on_surface.mean())
+        yield f"background: share of {view} changed by theme", float((on_surface | around).mean())
     clean = renderer.frame("agentview")
     tests = {(test.component, test.parameters["severity"]): test for test in benchmark.load().on_axis("noise")}
     for test in tests.values():
         if test.parameters["severity"] in SEVERITIES:
             noisy = libero_plus.noise(test, 0).apply(clean, 0)
-            yield f"noise: {test.component} (mean grey levels)", float(np.abs(noisy.astype(float) - clean).mean())
+            change = float(np.abs(noisy.astype(float) - clean).mean())
+            yield f"noise: {test.component} (mean change in grey levels)", change
     renderer.close()
 
 

@@ -138,10 +138,10 @@ class BackgroundPerturbation(RenderPerturbation):
         return frozenset(Credit(c.texture, "texture", c.licence, "") for c in self.coverings)
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
-        """Measure the share of each view that changes."""
+        """Measure the changed share of each view."""
         for view, changes in episode.changes().items():
             share = float((changes.max(axis=2) >= CHANGED_LEVELS).mean())
-            yield f"share of {view} that {self.component} changes", share
+            yield f"share of {view} changed by {self.component}", share
 
 
 class BackgroundAxis(Axis):
@@ -220,7 +220,7 @@ class BackgroundAxis(Axis):
     def describe_coverage(
         cls, kept: Sequence[KeptPerturbation[BackgroundPerturbation]], test: TestSet
     ) -> CoveragePlots:
-        """Describe a plot of the images by their source."""
+        """Describe a plot of the images by source and family."""
         names: list[str] = []
         for item in kept:
             names += [covering.texture for covering in item.perturbation.coverings]
@@ -231,9 +231,9 @@ class BackgroundAxis(Axis):
         # Examples of names: procedural:brick/028, metaworld:floor2.png.
         sources = Counter(name.rpartition("/" if "/" in name else ":")[0] for name in names)
         return CoveragePlots(
-            f"{len(set(names))} different images in {len(kept)} draws. The {len(tested):,} test tasks show "
-            f"{len(images)}; a run stops where one of them is shared, by name or by content.",
-            [Bars("images by source and family", sources, "background", "uses")],
+            f"{len(set(names))} distinct images in {len(kept)} perturbations. The {len(tested):,} test tasks show "
+            f"{len(images)} images. A run stops if it has an image with the name or the content of one of these.",
+            [Bars("Images by source and family", sources, "background", "uses")],
         )
 
 

@@ -157,7 +157,7 @@ class Perturbation(Frozen):
         return None
 
     def observe(self, episode: ObservedEpisode) -> Measures:
-        """Measure what a policy sees of this change in a kept ``episode`` that has no other change."""
+        """Measure the visible effects of this change in a kept ``episode`` that has no other change."""
         return ()
 
 
@@ -270,7 +270,7 @@ class Axis(Frozen):
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> CoveragePlots:
         """Describe plots of the perturbations of kept episodes, next to the test tasks.
 
-        The default has the level and every parameter that is a number.
+        By default, there is one plot of the level and one of each numeric parameter.
         """
         parameters = []
         for parameter, field in cls.draws[0].model_fields.items():
@@ -279,12 +279,12 @@ class Axis(Frozen):
         plots: list[Plot] = []
         for parameter in ("level", *parameters):
             values = np.array([getattr(item.perturbation, parameter) for item in kept], float)
-            plots.append(Strips(parameter.replace("_", " "), {"draws": {cls.name(): values}}, parameter))
+            plots.append(Strips(parameter.replace("_", " "), {"episodes": {cls.name(): values}}, parameter))
         return CoveragePlots(f"{len(test.on_axis(cls.name())):,} test tasks.", plots)
 
     @classmethod
     def observe_tests(cls, test: TestSet) -> Measures:
-        """Measure what a policy sees of the axis in the test tasks, under the names of ``Perturbation.observe``.
+        """Measure the visible effects of the axis in the test tasks, under the names of ``Perturbation.observe``.
 
         Measures that need a simulator are not computed here: ``benchmarks/test_tasks_seen.py`` has stored them.
         """

@@ -430,12 +430,12 @@ class CameraAxis(Axis):
 
     @classmethod
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[CameraPerturbation]], test: TestSet) -> CoveragePlots:
-        """Describe plots of the cameras' places, distances and turns."""
+        """Describe plots of the positions, the distances and the rotations of the cameras."""
         tested = [task.parameters for task in test.on_axis("camera")]
         cameras = [item.perturbation for item in kept]
 
         def points(first: str, second: str) -> dict[str, Floats]:
-            """Return distinct points (N, 2) of the test tasks, many of which share a camera, and the perturbations'."""
+            """Return the distinct points (N, 2) of the test tasks, and the points of the perturbations."""
             test_points = [(float(parameters[first]), float(parameters[second])) for parameters in tested]
             read = attrgetter(first, second)
             return {
@@ -448,11 +448,11 @@ class CameraAxis(Axis):
             "camera": np.array([camera.distance_scale for camera in cameras]),
         }
         return CoveragePlots(
-            f"{len(tested):,} test cameras. A draw is a point in each plot; what it leaves alone stays LIBERO's. Where "
-            "it lies on a test camera in one plot, it is apart from it in another.",
+            f"{len(tested):,} test cameras. A kept episode is one point in each plot; its unchanged parameters have "
+            "LIBERO's values. A camera that keeps its clearance may equal a test camera in one plot, but not in all.",
             [
-                Scatter("where it stands", points("azimuth_deg", "elevation_deg"), "azimuth (°)", "elevation (°)"),
-                Strips("how far away", {"scale": scales}, "multiple of the distance"),
-                Scatter("how it is turned in place", points("yaw_deg", "pitch_deg"), "yaw (°)", "pitch (°)"),
+                Scatter("Position", points("azimuth_deg", "elevation_deg"), "azimuth (°)", "elevation (°)"),
+                Strips("Distance", {"scale": scales}, "multiple of the distance"),
+                Scatter("Rotation in place", points("yaw_deg", "pitch_deg"), "yaw (°)", "pitch (°)"),
             ],
         )

@@ -71,7 +71,7 @@ class LanguagePerturbation(TextPerturbation):
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Count the words of the instruction."""
-        yield "words", len(episode.instruction.split())
+        yield "words in the instruction", len(episode.instruction.split())
 
 
 class LanguageAxis(Axis):
@@ -154,11 +154,11 @@ class LanguageAxis(Axis):
     def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:
         """Count the words of each test instruction."""
         for tested in test.on_axis("language"):
-            yield "words", len(str(tested.parameters["text"]).split())
+            yield "words in the instruction", len(str(tested.parameters["text"]).split())
 
     @classmethod
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[LanguagePerturbation]], test: TestSet) -> CoveragePlots:
-        """Describe plots of the distances to the original wordings."""
+        """Describe plots of the distances to the original instructions."""
         tested = test.on_axis("language")
         tested_shares = []
         for task in tested:
@@ -170,12 +170,12 @@ class LanguageAxis(Axis):
             of_class = [share for share, item in zip(shares, kept, strict=True) if item.perturbation.component == name]
             rows[name.replace("_", " ")] = {"language": np.array(of_class)}
         every = {BENCHMARK: np.array(tested_shares), "language": np.array(shares)}
-        label = "share of characters edited"
+        label = "share of edited characters"
         return CoveragePlots(
-            f"{len(tested):,} test instructions, of no stated class. The distance is the share of characters to edit.",
+            f"{len(tested):,} test instructions of unknown class. The distance is the share of edited characters.",
             [
-                Histogram("distance to the original wording", every, np.linspace(0, 1, 21), label),
-                Strips("the same by class", rows, label),
+                Histogram("Distance to the original instruction", every, np.linspace(0, 1, 21), label),
+                Strips("Distance by class", rows, label),
             ],
         )
 

@@ -196,11 +196,11 @@ class LayoutAxis(Axis):
             "layout": np.array([len(item.perturbation.objects) for item in kept], float),
         }
         return CoveragePlots(
-            f"{len(tested):,} test tasks. Objects of {len(categories)} categories were added; a run stops where a test "
-            "task in the same scene adds one of these.",
+            f"{len(tested):,} test tasks. The kept episodes add objects of {len(categories)} categories. A run stops "
+            "if a test task adds an object of such a category to the same scene.",
             [
-                Scatter("where objects stand", places, "x from the surface's centre (m)", "y (m)", equal=True),
-                Histogram("objects added", number, np.arange(0.5, 7.0), "objects"),
+                Scatter("Positions of added objects", places, "x from the surface's centre (m)", "y (m)", equal=True),
+                Histogram("Number of added objects", number, np.arange(0.5, 7.0), "objects"),
             ],
         )
 
@@ -214,13 +214,14 @@ def _test_places_m(tested: TestTask) -> Floats:
 def _measures(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:
     """Measure a scene with added objects, by their models and their places (N, 2) in the frame of the surface."""
     for number in range(1, 6):
-        yield f"scenes with {number} added", len(models) == number
+        yield f"scenes with {number} added object{'s' * (number > 1)}", len(models) == number
     if len(models) > 1:
-        yield f"scenes with {len(models)} added that repeat a model", len(set(models)) < len(models)
+        yield f"scenes with {len(models)} added objects and a repeated model", len(set(models)) < len(models)
     x_m, z_m = ARENAS[arena].camera_xz_m
     for place in xy_m:
-        yield "object on the camera's side", bool(place[0] > CAMERA_SIDE_M)
-        yield "object to camera (m)", float(np.hypot(np.linalg.norm(place - [x_m, 0.0]), z_m))
+        yield "objects on the camera's side", bool(place[0] > CAMERA_SIDE_M)
+        away_m = float(np.hypot(np.linalg.norm(place - [x_m, 0.0]), z_m))
+        yield "distance from an added object to the camera (m)", away_m
 
 
 @cache

@@ -60,7 +60,7 @@ more than ``BRIGHT_SHARE`` of its pixels have no channel below ``BRIGHT_LEVEL``.
 
 
 class LightPerturbation(RenderPerturbation):
-    """Changed lamps.
+    """A new colour, direction, gloss or shadow of the scene's lamps.
 
     Attributes:
         diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel. Lamps that add up to more than
@@ -220,16 +220,16 @@ class LightAxis(Axis):
         """Describe plots of brightness, tint, gloss and direction."""
         lights = [item.perturbation for item in kept]
         columns = {
-            "brightness": ("multiple of the diffuse light", [float(np.mean(p.diffuse_scale_rgb)) for p in lights]),
-            "tint": ("saturation", [1 - min(p.diffuse_scale_rgb) / max(*p.diffuse_scale_rgb, 1e-9) for p in lights]),
-            "gloss": ("multiple of the specular light", [p.specular_scale for p in lights]),
-            "direction": ("lamps tilted by (°)", [p.tilt_deg for p in lights]),
+            "Brightness": ("multiple of the diffuse light", [float(np.mean(p.diffuse_scale_rgb)) for p in lights]),
+            "Tint": ("saturation", [1 - min(p.diffuse_scale_rgb) / max(*p.diffuse_scale_rgb, 1e-9) for p in lights]),
+            "Gloss": ("multiple of the specular light", [p.specular_scale for p in lights]),
+            "Direction": ("tilt of the lamps (°)", [p.tilt_deg for p in lights]),
         }
         return CoveragePlots(
-            f"{len(test.on_axis('light')):,} test tasks, whose values are unknown offline: they are published only "
-            f"within the benchmark's asset archive. {sum(p.shadows for p in lights)} of {len(lights)} draws cast "
+            f"{len(test.on_axis('light')):,} test tasks. Their parameters are not plotted, because they are only in "
+            f"the benchmark's asset archive. {sum(p.shadows for p in lights)} of {len(lights)} perturbations cast "
             "shadows.",
-            [Strips(name, {"draws": {"light": np.array(own)}}, label) for name, (label, own) in columns.items()],
+            [Strips(name, {"episodes": {"light": np.array(own)}}, label) for name, (label, own) in columns.items()],
         )
 
 

@@ -90,7 +90,7 @@ class NoisePerturbation(PixelPerturbation):
         """Measure the mean change of the agent view."""
         changes = episode.changes()
         if changes:
-            yield f"{self.component} (mean grey levels)", float(changes["image"].mean())
+            yield f"{self.component} (mean change in grey levels)", float(changes["image"].mean())
 
     def severity(self, test: TestSet) -> float:
         """Return the strength on the scale of the component's test severities.
@@ -231,9 +231,9 @@ class NoiseAxis(Axis):
                 at = np.interp([float(getattr(p.effect, name)) for p in of_component], values, steps)
             rows[component.replace("_", " ")] = {BENCHMARK: severities, "noise": at}
         return CoveragePlots(
-            f"{len(test.on_axis('noise')):,} test tasks at ten severities of each kind; a draw stands where its "
-            "strength would, on the benchmark's scale.",
-            [Strips("strength by kind", rows, "severity")],
+            f"{len(test.on_axis('noise')):,} test tasks at ten severities of each component. Strengths are converted "
+            "to the benchmark's scale of severities.",
+            [Strips("Strength by component", rows, "severity")],
         )
 
 

@@ -265,7 +265,7 @@ class ScenePerturbation(_PosePerturbation):
         return self._apart_m(lambda name: [shifts.get(name, NOWHERE) for shifts in shifts_of_others])
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
-        """Measure how far the objects are moved that the task moves."""
+        """Measure the displacements of the objects that the task moves."""
         return _targets_moved(episode.task, self.shifts_in_all, self.level)
 
     @property
@@ -435,7 +435,7 @@ class PoseAxis(Axis):
 
     @classmethod
     def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:
-        """Measure how far each test task moves its targets, and how far it is from the nearest other test task."""
+        """Measure the displacements of each test task's targets, and the distance to the nearest other test task."""
         places: _Places = defaultdict(list)
         for tested in test.on_axis("pose"):
             task = find_task(tested.suite, tested.base)
@@ -446,9 +446,9 @@ class PoseAxis(Axis):
 
     @classmethod
     def observe_together(cls, kept: Sequence[KeptPerturbation[_PosePerturbation]], test: TestSet) -> Measures:
-        """Measure how far each test task is from the nearest of all episodes of its task.
+        """Measure the distance from each test task to the nearest of all episodes of its task.
 
-        Test tasks are left out for which no episode moves an object of interest.
+        A test task is left out if no episode moves one of its objects of interest.
         """
         places: _Places = defaultdict(list)
         for item in kept:
@@ -471,17 +471,17 @@ class PoseAxis(Axis):
         plots: list[Plot] = []
         if alone:
             turns = {"yaw": {"pose": np.array([p.dyaw_deg for p in alone])}}
-            plots.append(_plot_shifts("where the moved object goes", targets, [(p.dx_m, p.dy_m) for p in alone]))
-            plots.append(Strips("how far it turns", turns, "degrees"))
+            plots.append(_plot_shifts("Displacement of the moved object", targets, [(p.dx_m, p.dy_m) for p in alone]))
+            plots.append(Strips("Rotation of the moved object", turns, "degrees"))
         if scenes or not alone:
             moved: list[tuple[float, float]] = []
             for parameters in tested:
                 moved += displacements(parameters).values()
             shifts_m = [(move.dx_m, move.dy_m) for scene in scenes for move in scene.moves]
-            plots.append(_plot_shifts("where each thing of a scene goes", moved, shifts_m))
+            plots.append(_plot_shifts("Displacement of all objects of a scene", moved, shifts_m))
         return CoveragePlots(
-            f"{len(tested):,} test tasks, of which {len(targets):,} move the target, and all of which move everything "
-            f"else as well. {len(scenes)} of {len(kept)} draws move the whole scene. Turns are this project's own.",
+            f"{len(targets):,} of {len(tested):,} test tasks move the target; all of them move all other objects as "
+            f"well. {len(scenes)} of {len(kept)} perturbations move the whole scene. No test task turns an object.",
             plots,
         )
 
@@ -499,11 +499,12 @@ def _targets_moved(task: Task, shifts: Shifts, level: int) -> Iterator[tuple[str
     """Measure the displacements of the objects that a task moves."""
     for target in bddl.read(task.bddl_file).targets:
         if target in shifts:
-            yield f"target of {task.suite} moved, level {level} (cm)", 100 * float(np.hypot(*shifts[target]))
+            moved_cm = 100 * float(np.hypot(*shifts[target]))
+            yield f"displacement of the target in {task.suite}, level {level} (cm)", moved_cm
 
 
 def _to_nearest(test: TestSet, places: _Places) -> Iterator[tuple[str, float]]:
-    """Measure how far the objects of interest of each test task are from their nearest places under other names."""
+    """Measure the distance of each test task's objects of interest to their nearest places under other names."""
     for tested in test.on_axis("pose"):
         task = find_task(tested.suite, tested.base)
         tested_shifts = displacements(tested.parameters)
@@ -513,4 +514,4 @@ def _to_nearest(test: TestSet, places: _Places) -> Iterator[tuple[str, float]]:
                 continue
             apart_m = [math.dist(tested_shifts[thing], shifts[thing]) for shifts in others if thing in shifts]
             if apart_m:
-                yield f"test's thing of interest in {task.suite} to the nearest other (cm)", 100 * min(apart_m)
+                yield f"distance of a test object in {task.suite} to its nearest placement (cm)", 100 * min(apart_m)

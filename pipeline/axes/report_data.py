@@ -92,8 +92,8 @@ class CoveragePlots(NamedTuple):
 
 
 Measures = Iterable[tuple[str, float]]
-"""Names of visible effects, with their units, and one value each. The report has the percentiles of each name's values,
-and the share of truth values."""
+"""Names of visible effects, with their units, and one value each. The report has percentiles of numbers and shares of
+truth values."""
 
 
 class ObservedEpisode(Protocol):

@@ -39,7 +39,7 @@ Component = Literal["initial_joints", "controller_posture"]
 
 
 class RobotPerturbation(PhysicsPerturbation):
-    """A posture away from where the demonstration starts.
+    """A posture with an offset from the start of the demonstration.
 
     ``initial_joints`` puts the arm into the posture, and the controller holds it there. ``controller_posture`` copies
     LIBERO-Plus's robot tasks, in which the reset has another posture and the recorded state is restored afterwards. The
@@ -121,7 +121,7 @@ class RobotPerturbation(PhysicsPerturbation):
         return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()), compared)
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
-        """Measure how far the hand starts from the clean twin's."""
+        """Measure the displacement and the rotation of the hand at the start from the clean twin's start."""
         twin = episode.twin_look()
         if twin is not None:
             yield from measure_start(episode.look(), twin, self.component, self.level)
@@ -145,8 +145,8 @@ def benchmark_offsets_rad() -> Floats:
 
 def measure_start(start: Look, twin: Look, component: str, level: int) -> Iterator[tuple[str, float]]:
     """Measure how far the hand is moved and turned in an episode's first observation, relative to its clean twin."""
-    yield f"hand moved by {component}, level {level} (cm)", start.moved_cm(twin)
-    yield f"hand turned by {component}, level {level} (degrees)", start.turned_deg(twin)
+    yield f"displacement of the hand by {component}, level {level} (cm)", start.moved_cm(twin)
+    yield f"rotation of the hand by {component}, level {level} (degrees)", start.turned_deg(twin)
 
 
 class RobotAxis(Axis):
@@ -187,7 +187,7 @@ class RobotAxis(Axis):
 
     @classmethod
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[RobotPerturbation]], test: TestSet) -> CoveragePlots:
-        """Describe plots of the offsets' sizes, and of each joint's offsets."""
+        """Describe plots of the norms of the offsets, and of the offsets of each joint."""
         ids = [int(task.parameters["id"]) - 1 for task in test.on_axis("robot")]
         tested = benchmark_offsets_rad()[ids].reshape(-1, 7)
         offsets = np.array([item.perturbation.joint_offsets_rad for item in kept]).reshape(-1, 7)
@@ -196,9 +196,9 @@ class RobotAxis(Axis):
             joints[f"joint {joint + 1}"] = {BENCHMARK: np.unique(tested[:, joint]), "robot": offsets[:, joint]}
         norms = {BENCHMARK: np.linalg.norm(tested, axis=1), "robot": np.linalg.norm(offsets, axis=1)}
         return CoveragePlots(
-            f"{len(ids):,} test tasks with {len(set(ids))} different offsets.",
+            f"{len(ids):,} test tasks with {len(set(ids))} distinct offsets.",
             [
-                Histogram("size of the offset", norms, np.arange(0.025, 0.6, 0.05), "norm (rad)"),
-                Strips("offset by joint, base to wrist", joints, "rad"),
+                Histogram("Norm of the joint offsets", norms, np.arange(0.025, 0.6, 0.05), "norm (rad)"),
+                Strips("Offset of each joint, from base to wrist", joints, "rad"),
             ],
         )

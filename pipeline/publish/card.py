@@ -1,4 +1,4 @@
-"""The dataset card: it explains the content of a repository to readers who find it on the hub."""
+"""The dataset card, which explains the content of a repository to readers on the hub."""
 
 import inspect
 import re
@@ -111,11 +111,11 @@ def render(
         others: titles of the other formats.
         rows: the manifest.
         reports: contents of the files of ``REPORTS``.
-        clients: the section of that name in ``finetune.yaml``, which states how each policy's code is called.
+        clients: the section of that name in ``finetune.yaml``, which has the training command of each policy's code.
         sheets: the axes that have a picture.
         name: name of the dataset.
         source: source of the demonstrations, ``starter`` or ``hdf5``.
-        episodes: ``plan.episodes``, empty if the manifest does not have it.
+        episodes: ``plan.episodes``, empty if the manifest lacks it.
         publish: the publisher's statements.
     """
     leakage, validation, statistics = (reports[report] for report in REPORTS)
@@ -161,7 +161,7 @@ def render(
         statistics=statistics,
         validation=validation,
         failed=[check for check, found in validation.items() if found["findings"]],
-        # Any kept episode is an example, with which readers who have the dataset can run the command unchanged.
+        # With a kept episode as the example, readers of the dataset can run the command unchanged.
         example=min(row["episode_id"] for row in kept),
         versions=manifest.made_with(kept[0]),
         devices=sorted({row["gl_device"] for row in kept}),
@@ -175,7 +175,7 @@ def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
     """Count the episodes that show each third-party work, sorted by kind and name.
 
     Args:
-        perturbations: for each episode, the column of that name in the plan or the manifest. Nothing else is read.
+        perturbations: for each episode, the column of that name in the plan or the manifest.
     """
     counts: Counter[Credit] = Counter()
     for text in perturbations:
@@ -185,7 +185,7 @@ def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
 
 
 def _own_rewrites(kept: Iterable[Mapping[str, Any]]) -> bool:
-    """Return whether an instruction is a rewrite that the shipped bank does not have."""
+    """Return whether an instruction is a rewrite from outside the shipped bank."""
     for row in kept:
         for change in from_json(row["perturbations"]):
             if isinstance(change, LanguagePerturbation):
@@ -212,14 +212,14 @@ def _metadata(shown: AnyFormat, name: str, publish: PublishConfig, *, free: bool
 def _axes(kept: Iterable[Mapping[str, Any]], shown: AnyFormat) -> dict[str, dict[str, Any]]:
     """Collect, for each axis, its kinds of change, and the number of episodes with each component and level.
 
-    Combinations count for each of their axes.
+    Joint perturbations count for each of their axes.
     """
     axes: dict[str, dict[str, Any]] = {}
     for row in kept:
         for change in from_json(row["perturbations"]):
             axis = axes.setdefault(change.axis, {"kinds": {}, "levels": Counter()})
             what = (inspect.getdoc(type(change)) or "").partition("\n")[0]
-            kind = f"{what} Changes {_changes(change, shown)}."
+            kind = f"{what} It changes {_changes(change, shown)}."
             axis["kinds"].setdefault(kind, Counter())[change.component] += 1
             axis["levels"][change.level] += 1
     return axes
@@ -229,7 +229,7 @@ def _changes(change: Perturbation, shown: AnyFormat) -> str:
     if change.layer == Layer.TEXT:
         return "the instruction"
     views = " and ".join(f"`{shown.keys[view]}`" for view in SCHEMA.views if view in change.views)
-    return f"{views}, state and length" if change.layer == Layer.PHYSICS else views
+    return f"{views}, the states and the length" if change.layer == Layer.PHYSICS else views
 
 
 def _yields(rows: Sequence[Mapping[str, Any]]) -> list[list[object]]:

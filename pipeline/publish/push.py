@@ -45,7 +45,7 @@ class Upload:
         dataset: path in the repository to local file, for the files of the dataset.
         others: path in the repository to local file, for all other files.
         sha256: path in the repository to the recorded checksum.
-        folders: top folders of the repository in which only the dataset may lie.
+        folders: top folders of the repository that may contain only the dataset.
         tag: name that the commit gets, if a client's loader asks for it.
     """
 
@@ -105,7 +105,9 @@ def prepare(target: Format[Any], run: Run) -> Upload:
         source = run.path(name)
         if source.is_symlink() or checksum(source) != recorded_sha256:
             raise PipelineError(
-                "is a link, or has changed since the card was generated from it", where=source, remedy=MAKE_AGAIN
+                "the file is a link, or has changed since the card was generated from it",
+                where=source,
+                remedy=MAKE_AGAIN,
             )
         others[name], sha256[name] = source, recorded_sha256
     # Folders of the format that are empty now, such as videos, belong to the dataset, too.
@@ -117,7 +119,7 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
     """Read the repository on the hub, and list the files that an upload would delete there; nothing is sent.
 
     Returns:
-        Words: the state of the repository, and every file that would be deleted.
+        A description of the repository, and of every file that would be deleted.
 
     Raises:
         PipelineError: if the repository has files of another origin, or a file here has changed.
@@ -127,13 +129,18 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
         name = _full_name(api, repository)
         there = read(api, name)
     except FAILURES as error:
-        return f"not known what {repository} has, and what would be deleted there: {' '.join(str(error).split())}"
+        return f"the content of {repository} and its deleted files are unknown: {' '.join(str(error).split())}"
     if there is None:
-        return f"{name} is not there, or your token may not see it: it would be created"
+        return f"{name} does not exist or is hidden from your token: it would be created"
     _, new = _contents(upload, name)
     gone = _deleted(there, new, upload.folders, private=private, replace=replace)
     kind = "private" if there.private else "public"
-    return "\n".join([f"{name} ({kind}) has {len(there.files)} files; deleted: {len(gone)}", *(f"  {x}" for x in gone)])
+    return "\n".join(
+        [
+            f"{name} ({kind}) has {len(there.files)} files; the upload would delete {len(gone)}",
+            *(f"  {x}" for x in gone),
+        ]
+    )
 
 
 def send(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
@@ -157,7 +164,8 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
     try:
         if get_token() is None:
             raise PipelineError(
-                f"no token for {api.endpoint}", remedy="hf auth login, or HF_TOKEN=..., with a token that may write"
+                f"no token for {api.endpoint}",
+                remedy="log in with `hf auth login`, or set HF_TOKEN, with a token that may write",
             )
         repository = _full_name(api, repository)
         contents, sent = _contents(upload, repository)
@@ -166,7 +174,11 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             api.create_repo(repository, repo_type="dataset", private=private)
             there = read(api, repository)
         if there is None:
-            raise PipelineError("was created, but cannot be read", where=repository, remedy="a token that may read it")
+            raise PipelineError(
+                "the repository was created, but cannot be read",
+                where=repository,
+                remedy="use a token that may read it",
+            )
         stale = _deleted(there, sent, upload.folders, private=private, replace=replace)
         contents[UPLOAD] = (sent.model_dump_json(indent=1) + "\n").encode()
         operations: list[CommitOperationAdd | CommitOperationDelete] = [
@@ -181,7 +193,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             parent_commit=there.commit,
         )
         _refuse_other_content(files_of(api, repository, str(commit.oid)), sent, repository)
-        if upload.tag is not None:  # an earlier upload may have the tag, which moves
+        if upload.tag is not None:  # An earlier upload may have the tag, which then moves.
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
             api.create_tag(repository, tag=upload.tag, repo_type="dataset")
@@ -199,7 +211,7 @@ def _deleted(there: Repository, new: LastUpload, folders: Set[str], *, private: 
     """List the paths that an upload deletes, or reject the upload."""
     if private and not there.private:
         raise PipelineError(
-            "is public, and --private asks for a private repository",
+            "the repository is public, but --private requests a private one",
             where=there.name,
             remedy="make it private in its settings on the hub, use another name, or leave --private out",
         )
@@ -222,7 +234,7 @@ def _contents(upload: Upload, repository: str) -> tuple[dict[str, Path | bytes],
         checksums[path] = content_of(content)
         if checksums[path].sha256 != upload.sha256[path]:
             raise PipelineError(
-                "has changed since it was checked", where=upload.files[path], remedy="run the command again"
+                "the file has changed since it was checked", where=upload.files[path], remedy="run the command again"
             )
     card = upload.files["README.md"].read_text().replace(REPOSITORY, repository).encode()
     contents["README.md"], checksums["README.md"] = card, content_of(card)
@@ -234,9 +246,9 @@ def _refuse_other_content(files: Mapping[str, RepoFile], sent: LastUpload, repos
     wrong = [path for path, content in sent.files.items() if path not in files or not content.is_of(files[path])]
     if wrong:
         raise PipelineError(
-            f"{len(wrong)} files on the hub are not as recorded, such as {wrong[0]}",
+            f"{len(wrong)} files on the hub differ from their record, such as {wrong[0]}",
             where=repository,
-            remedy="make the repository private if they are not to be seen, and run the command again",
+            remedy="make the repository private if the files are confidential, and run the command again",
         )
 
 
@@ -253,19 +265,19 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
     foreign = sorted(files.keys() - wanted)
     if foreign or linked:
         raise PipelineError(
-            f"{len(foreign)} files that are not of the dataset, {len(linked)} that lie elsewhere, such as "
+            f"the folder has {len(foreign)} foreign files and {len(linked)} links to files elsewhere, such as "
             f"{(foreign + linked)[0]}",
             where=root,
-            remedy=f"move them away (training may leave files), and `{MAKE_AGAIN}`",
+            remedy=f"move them to another folder (training may write files), and `{MAKE_AGAIN}`",
         )
     missing = sorted(wanted - files.keys())
     if missing:
-        raise PipelineError(f"lacks {len(missing)} files, such as {missing[0]}", where=root, remedy=MAKE_AGAIN)
+        raise PipelineError(f"{len(missing)} files are missing, such as {missing[0]}", where=root, remedy=MAKE_AGAIN)
     return files
 
 
 def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
-    """Raise an error unless exactly these files passed validation, and there is a card.
+    """Raise an error unless exactly these files passed validation, and the card exists.
 
     The content of the report that the card was generated from is compared in ``prepare``.
     """
@@ -277,13 +289,13 @@ def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
             f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}",
             where=report,
             expected="at least one check, and no findings",
-            remedy=f"mend what it finds, and `{MAKE_AGAIN}`",
+            remedy=f"correct the causes of the findings, and `{MAKE_AGAIN}`",
         )
     if not card.is_file():
-        raise PipelineError("not there", where=card, remedy=MAKE_AGAIN)
+        raise PipelineError("the card is missing", where=card, remedy=MAKE_AGAIN)
     newest = max(*files.values(), run.manifest_file, key=_written)
     if _written(report) < _written(newest):
-        raise PipelineError(f"older than {newest}, which it is about", where=report, remedy=MAKE_AGAIN)
+        raise PipelineError(f"the report is older than {newest}, which it describes", where=report, remedy=MAKE_AGAIN)
 
 
 def _written(file: Path) -> int:
@@ -297,14 +309,14 @@ def _explained(error: Exception, repository: str, endpoint: str) -> PipelineErro
     response = None if cause is None else cause.response
     status = 0 if response is None else response.status_code
     if status in (409, 412):
-        what = f"{repository} has changed, or was created, since it was read"
+        what = f"{repository} has changed or was created since it was read"
         remedy = "run the command again: it reads the repository first"
     elif status in (401, 403, 404):
-        what = f"{repository} does not let you write"
-        remedy = "hf auth login with a token that has the right to, and mind the owner's name"
+        what = f"your token may not write to {repository}"
+        remedy = "log in with `hf auth login` and a token that may write, and check the owner's name"
     elif 400 <= status < 500 or not isinstance(error, OSError | RuntimeError | httpx.HTTPError):
-        what, remedy = f"the upload to {repository} is refused", "mend what the hub says"
+        what, remedy = f"the hub rejected the upload to {repository}", "correct the cause that the hub reports"
     else:
         what = f"the upload to {repository} stopped"
-        remedy = "check the network (or HF_ENDPOINT) and run it again: what was sent is not sent again"
+        remedy = "check the network (or HF_ENDPOINT), and run the command again: it does not repeat finished files"
     return PipelineError(f"{what} ({' '.join(str(error).split())})", where=endpoint, remedy=remedy)

@@ -1,6 +1,7 @@
 """Panels for each axis: the parameters of a run next to those of the test tasks, and the distances between them."""
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,10 @@ from pipeline.planning import leakage
 from pipeline.report import figures
 from pipeline.report.figures import Panel
 from pipeline.testset.benchmark import TestSet
+
+
+LABEL_WIDTH = 28
+"""Longest line of a label, in characters; a longer line would not fit below a plot with long names of rows."""
 
 
 class AxisPlots(NamedTuple):
@@ -31,7 +36,7 @@ def plot_axis(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -
 
 
 def _distances(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet, unit: str) -> Panel:
-    """Plot the distance from each test task to the nearest perturbation.
+    """Plot the distance from each test task to the nearest perturbation of a kept episode.
 
     Test tasks that cannot be compared with any perturbation are left out.
     """
@@ -41,4 +46,4 @@ def _distances(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet, 
     for component in dict.fromkeys(components.tolist()):
         comparable = (components == component) & np.isfinite(least)
         rows[component.replace("_", " ")] = {axis: least[comparable]}
-    return figures.strips("from each test task to the nearest draw", rows, unit)
+    return figures.strips("Distance from each test task to the nearest kept episode", rows, fill(unit, LABEL_WIDTH))

@@ -29,11 +29,11 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     """Compute the findings of evaluations, JSON-serialisable.
 
     Returns:
-        ``policies``: name to settings, versions, number of refused episodes, ``overall``: the ``success_rate`` of all
+        ``policies``: name to settings, versions, number of rejected episodes, ``overall``: the ``success_rate`` of all
         its episodes, and ``results``: ``summary`` by source.
         ``paper_table``: see ``paper_table``; `None` if no test task was run.
         ``comparisons``: each pair of policies on the episodes of a source that both ran, see ``compare``.
-        ``common``: source to the number of episodes that all policies ran, out of the policies that ran the source.
+        ``common``: source to the number of episodes that all policies with results of the source ran.
         ``failures``: episodes to show, and whether there is a video.
     """
     present: set[str] = set()
@@ -69,7 +69,7 @@ def _policy_findings(policy: Evaluated, sources: Sequence[str]) -> dict[str, Any
 
 
 def _common_trials(policies: Sequence[Evaluated], source: str) -> int:
-    """Count the trials of a source that all policies ran, out of the policies that ran any trial of it."""
+    """Count the trials of a source that are common to all policies with results of the source."""
     trials = []
     for policy in policies:
         rows = policy.from_source(source)
@@ -127,13 +127,13 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A success rate over the benchmark's tasks, from some of them.
+    """A success rate over the benchmark's tasks, estimated from some of them.
 
     Attributes:
         rate: in [0, 1].
         effective: the number of equally weighted episodes that would be as informative (Kish, 1965).
         low, high: Wilson's 95 % interval for that number (Korn and Graubard, 1998).
-        absent: the parts of the benchmark that no episode stands for.
+        absent: the parts of the benchmark without any episode.
     """
 
     episodes: int
@@ -147,7 +147,7 @@ class Estimate:
 def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
     """Compute the paper's table, with policies next to the published models; JSON-serialisable.
 
-    A balanced subset has as many easy tasks as hard tasks, but the benchmark has not. An episode is therefore weighted
+    A balanced subset has as many easy tasks as hard tasks, unlike the benchmark. An episode is therefore weighted
     by the number of test tasks of its axis, component and level, divided by the number of its episodes. Parts of the
     benchmark without an episode are left out of a column, and reported.
 

@@ -19,15 +19,18 @@ TITLES = {
     "goals": "Other goals in LIBERO's scenes",
     "libero": "LIBERO's tasks, unperturbed",
 }
-"""Titles of sources of tasks; other sources have their own names as titles."""
+"""Titles of the sources of tasks; the title of any other source is its name."""
 
 GROUPINGS = {
-    "by_axis": "by axis",
-    "by_axis_and_component": "by component",
-    "by_level": "by level",
-    "by_suite": "by suite",
+    "by_axis": "Success rate by axis",
+    "by_axis_and_component": "Success rate by component",
+    "by_level": "Success rate by level",
+    "by_suite": "Success rate by suite",
 }
-CLOSER = {"by_axis_and_level": "by axis and level", "by_suite_and_axis": "by suite and axis"}
+CLOSER = {
+    "by_axis_and_level": "Success rate by axis and level",
+    "by_suite_and_axis": "Success rate by suite and axis",
+}
 """Groupings of ``summary`` to their titles; the groupings of ``CLOSER`` are collapsed on the page and not plotted."""
 
 
@@ -45,7 +48,7 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
         PipelineError: when ``path`` is not the name of an HTML file, or would overwrite a file of another origin.
     """
     if path.suffix != ".html":
-        raise PipelineError("not the name of a page", where=path, expected="a name that ends in .html")
+        raise PipelineError("the report is an HTML page", where=path, expected="a name that ends in .html")
     json_path = path.with_suffix(".json")
     files.refuse_other_file(path, "<title>Evaluation: ")
     files.refuse_other_file(json_path, '"paper_table": ')

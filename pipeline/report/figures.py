@@ -26,7 +26,7 @@ OTHER = "#b0794a"
 """Colour of episodes that are perturbed on several axes."""
 
 INK = "#010203"
-"""A colour that nothing else has; the page's text colour replaces it."""
+"""A colour that is used for nothing else; the page's text colour replaces it."""
 
 STYLE: Any = {
     "font.size": 9,
@@ -79,7 +79,7 @@ def panel(title: str, plot: Callable[[Axes], None], height_in: float = HEIGHT_IN
 
 
 def plot(described: Plot) -> Panel:
-    """Plot what an axis describes."""
+    """Plot a description that an axis returned."""
     match described:
         case Scatter(title, groups, x_label, y_label, equal):
             return scatter(title, groups, x_label, y_label, equal)

@@ -1,7 +1,7 @@
 """Preview: the effect of an axis or a combination on a task, as a contact sheet in the manner of the paper's appendix.
 
-Every picture shows the demonstration's first state, without a replay; a push is shown in its replay, and in a
-combination at its end. The perturbations are the ones that a plan with the same seed samples for the demonstration.
+Every picture shows the first state of the demonstration without a replay. A single push is shown in its replay, and a
+push of a combination at its end. A plan with the same seed samples the same perturbations for the demonstration.
 """
 
 from collections.abc import Iterable, Sequence
@@ -36,18 +36,18 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task, Trajectory
 
 VARIANTS, PHYSICS_VARIANTS = 11, 3
-"""With the original, three rows of four; one row of four if each variant is a separate scene to compile."""
+"""Numbers of variants: with the original, three rows of four, or one row if each variant is compiled as a scene."""
 STRIP_STEPS = (0, 6, 16)
 """Control steps after the end of a push that a strip shows, in addition to its first step."""
 AFTER_PUSH_STEPS = 3
-"""Control steps after the end of a push that its picture shows: the hand is furthest from its path then."""
+"""Control steps from the end of a push to its picture, when the hand is furthest from its path."""
 SHOWN_LEVEL = 3
-"""Level of the perturbations that an overview shows, if it can: visible, and not yet extreme."""
+"""Preferred level of the perturbations in an overview: visible but not extreme."""
 CANDIDATES = 200
-"""Number of the plan's first perturbations, from which the variants are chosen; most take well under a millisecond."""
+"""Number of the plan's first perturbations from which the variants are chosen; most take under a millisecond."""
 
 SIDE_PX = {1: 256, 2: 192}
-"""Width of a frame, by how many views a tile shows."""
+"""Width of a frame, by the number of views of a tile."""
 REFUSED_GREY = (160, 160, 160)
 
 
@@ -88,7 +88,7 @@ class Stage:
         return replay(shared(self.demo.task), self.demo, "twin", self.replay)
 
     def strip(self, perturbation: Perturbation) -> list[tuple[int, list[Frame]]]:
-        """Render the agent view at some steps of a pushed replay, each without the push and with it.
+        """Render the agent view at some steps of a pushed replay, without and with the push.
 
         Raises:
             RefusedError: when the push is impossible in the demonstration, or its replay without one misses the goal.
@@ -115,9 +115,9 @@ class Stage:
 
 
 def staged(tasks: Iterable[Task], config: Config) -> Stage:
-    """Set up the first demonstration that the configured source has of any of the tasks.
+    """Set up the first demonstration of any of the tasks in the configured source.
 
-    Its scenes are rendered in the scene of this process, which the caller closes at the end (``scene_of_process``).
+    Its scenes are rendered in the scene of this process (``scene_of_process``), which the caller closes at the end.
 
     Raises:
         PipelineError: when the source has no usable demonstration.
@@ -131,9 +131,9 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
         problems += index.problems
     else:
         raise PipelineError(
-            f"no demonstration can be shown ({'; '.join(str(problem.error) for problem in problems)})",
+            f"the source has no usable demonstration ({'; '.join(str(problem.error) for problem in problems)})",
             where="demos",
-            remedy="correct what is wrong; tasks of LIBERO can be shown with configs/starter.yaml",
+            remedy="correct the named demonstrations; configs/starter.yaml has demonstrations of LIBERO's own tasks",
         )
     demo = source.load(index.entries[0].demo_id)
     model_xml = demo.model_xml
@@ -150,10 +150,10 @@ def configured(name: str, config: Config) -> Axis:
 
 
 def axes_for(name: str, config: Config) -> tuple[Axis, ...]:
-    """Return the axes of an axis's name or a combination's, such as ``camera+noise``, as a plan would sample them.
+    """Return the axes of a name or a combination, such as ``camera+noise``, with the ranges that a plan would use.
 
     Raises:
-        PipelineError: when an axis has nothing to sample next to the others.
+        PipelineError: when an axis has nothing to sample together with the others.
     """
     names = name.split("+")
     try:
@@ -163,7 +163,7 @@ def axes_for(name: str, config: Config) -> tuple[Axis, ...]:
 
 
 def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> list[Perturbation]:
-    """Choose perturbations of one axis, as ``combinations`` does of several."""
+    """Choose perturbations of one axis, as ``combinations`` does for several axes."""
     return [perturbation for (perturbation,) in combinations(name, (axis,), demo, seed, test)]
 
 
@@ -178,12 +178,11 @@ def combinations(
         For each episode, one perturbation of each axis.
 
     Raises:
-        PipelineError: when an axis has nothing to change in the task, or no perturbation of a level keeps the
-            clearance.
+        PipelineError: when an axis cannot change the task, or no perturbation of a level keeps the clearance.
     """
     for axis, axis_name in zip(axes, name.split("+"), strict=True):
         if not axis.applies(demo.task):
-            what = f"the axis {axis_name} has nothing to change in {demo.task}"
+            what = f"the axis {axis_name} cannot change the task {demo.task}"
             raise PipelineError(what, remedy="choose another task or another axis")
         axis.refuse_tested(test, demo.task)
     draws = Draws(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
@@ -209,12 +208,12 @@ def combinations(
 
 
 def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
-    """Render the sheet of an axis or a combination: the original top left, then the variants with their parameters.
+    """Render the sheet of an axis or a combination: the original first, then the variants with their parameters.
 
-    A grey tile with the reason stands for a perturbation that is impossible in the scene.
+    A grey tile with the reason replaces a perturbation that is impossible in the scene.
 
     Args:
-        name: an axis, or several joined by + in the order in which they apply (``pipeline.axes.axes_of``).
+        name: an axis, or several axes joined by + in the order in which they apply (``pipeline.axes.axes_of``).
         test: the benchmark's test tasks, to which the plan's perturbations keep a clearance.
     """
     demo, seed = stage.demo, config.plan.seed
@@ -237,7 +236,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     for perturbations in drawn:
         caption = "; ".join(map(describe, perturbations))
         try:
-            # A perturbation of the words alone changes no frame.
+            # A perturbation of the instruction alone changes no frame.
             visible = any(p.views for p in perturbations)
             frames = stage.frames(views, *perturbations) if visible else original
             tiles.append(Tile(side_by_side(frames, side), caption))
@@ -249,7 +248,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
 
 
 def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
-    """Render the strip of a push that is the only perturbation; empty for others."""
+    """Render the strip of a push that is the only perturbation; empty for any other perturbation."""
     push = perturbations[0]
     if len(perturbations) > 1 or push.acts_until is None:
         return []
@@ -264,8 +263,8 @@ def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
 def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     """Render one sheet of all axes: the agent view of the clean twin, then one perturbation of each axis that applies.
 
-    For each axis, it is the perturbation of the plan's first ones that is possible in the scene and nearest to level
-    ``SHOWN_LEVEL``. A rewritten instruction is printed in place of an unchanged view.
+    The perturbation of an axis is one of the plan's first that is possible in the scene, with the level nearest to
+    ``SHOWN_LEVEL``. A rewritten instruction is printed in place of the unchanged view.
 
     Args:
         test: the benchmark's test tasks, to which the plan's perturbations keep a clearance.
@@ -278,7 +277,7 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
         if axis.applies(demo.task) and not without_rewrites:
             drawn = variants(name, axis, demo, config.plan.seed, test)
             tiles.append(_typical(stage, drawn) if drawn else _nothing_drawn(name))
-    return sheet(f"{demo.task}: first frame of the agent view, one draw of each axis", tiles, 5)
+    return sheet(f"{demo.task}: first frame of the agent view, one perturbation of each axis", tiles, 5)
 
 
 def _typical(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
@@ -296,11 +295,12 @@ def _typical(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
 
 
 def _nothing_drawn(name: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
-    return Tile(Image.new("RGB", size_px, REFUSED_GREY), f"no draw of {name} keeps clear of the test set here")
+    caption = f"no perturbation of {name} keeps its clearance to the test set in this task"
+    return Tile(Image.new("RGB", size_px, REFUSED_GREY), caption)
 
 
 def _refused(why: RefusedError, caption: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
-    return Tile(Image.new("RGB", size_px, REFUSED_GREY), f"refused, {why.reason}: {caption}")
+    return Tile(Image.new("RGB", size_px, REFUSED_GREY), f"rejected, {why.reason}: {caption}")
 
 
 def for_run(config: Config, folder: Path, workers: Workers) -> None:
@@ -323,8 +323,8 @@ def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     # The folder exists if another worker was lost while it rendered these sheets.
     folder.mkdir(parents=True, exist_ok=True)
     stage = staged(tasks, config)
-    # The deepest layer comes last: an axis that adds objects opens a scene for each perturbation, after which the
-    # demonstration's scene would have to be opened again.
+    # The deepest layer comes last: an axis that adds objects opens a scene for each perturbation. Any later axis would
+    # have to open the demonstration's scene again.
     for name, axis in reversed(config.plan.axes.configured().items()):
         if axis.applies(stage.demo.task):
             axis_sheet(stage, name, config, test).save(folder / f"{name}.png")

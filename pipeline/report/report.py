@@ -39,14 +39,14 @@ ById = Mapping[str, Mapping[str, Any]]
 """Episode id to its row of the manifest."""
 
 REWRITES = 12
-"""Number of rewrites that are quoted."""
+"""Number of quoted rewrites."""
 
 WORST = 10
-"""Number of episodes shown that moved other objects farthest."""
+"""Number of videos of the largest displacements of other objects."""
 
 
 class Video(NamedTuple):
-    """An episode next to its twin, and the perturbations."""
+    """A perturbed episode next to its clean twin, with a caption."""
 
     axis: str
     caption: str
@@ -103,7 +103,7 @@ def _headline(tried: Rows, kept: Rows) -> dict[str, str]:
     steps = sum(row["steps"] for row in kept)
     headline = {
         **asdict(Counts.of(tried)),
-        "twins among them": sum(row["role"] == "twin" for row in kept),
+        "kept clean twins": sum(row["role"] == "twin" for row in kept),
         "tasks": len({(row["suite"], row["task"]) for row in kept}),
         "steps": steps,
         f"minutes at {SCHEMA.fps_hz} Hz": round(steps / SCHEMA.fps_hz / 60),
@@ -136,7 +136,7 @@ def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id")
 
 
 def _own_motion(kept: Rows, twins: ById, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:
-    """Plot the actions of each axis next to the actions of the twins, for axes with replays of their own."""
+    """Plot the actions of each axis with replays of its own, next to the actions of the clean twins."""
     panels = {}
     for axis, rows in by_axis(kept).items():
         paired = [row for row in rows if row["twin_id"] in twins]
@@ -167,7 +167,7 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
         return row["steps"] - steps[row["twin_id"]] if steps[row["twin_id"]] else None
 
     perturbed = [row for row in kept if row["axis"] != "clean"]
-    return [*panels, _strips("longer than the twin by", perturbed, longer, "steps")] if perturbed else panels
+    return [*panels, _strips("Difference from the clean twin", perturbed, longer, "steps")] if perturbed else panels
 
 
 def _worst(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
@@ -187,7 +187,7 @@ def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
         for made in from_json(row["perturbations"]):
             drawn_on.setdefault(made.axis, []).append((row, made))
     for axis, of_axis in drawn_on.items():
-        table = yields.by_level("kept of planned, by component", [row for row, _ in of_axis], axis)
+        table = yields.by_level("Kept/planned episodes, by component", [row for row, _ in of_axis], axis)
         kept = []
         for row, made in of_axis:
             if row["kept"]:
@@ -198,7 +198,7 @@ def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
 
 
 def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
-    """Quote class and level, original wording and rewrite, taking turns among the classes."""
+    """Quote class and level, original instruction and rewrite, with the classes in turn."""
     quoted: dict[str, list[tuple[str, str, str]]] = {}
     for row in kept:
         for made in from_json(row["perturbations"]):
@@ -211,7 +211,7 @@ def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
 
 
 def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
-    """Show, for each axis, the strongest episode that changes the agent view, next to its twin.
+    """Show, for each axis, the strongest episode that changes the agent view, next to its clean twin.
 
     Among equally strong episodes, the shortest is shown.
     """

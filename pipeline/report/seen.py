@@ -1,7 +1,7 @@
-"""Visible effects of perturbations: a run's kept episodes next to the benchmark's test tasks, axis by axis.
+"""Visible effects of perturbations: in a run's kept episodes and in the benchmark's test tasks, axis by axis.
 
-Other measures compare parameters. The measures here are centimetres of the hand, shares of a view, grey levels and
-words; each axis states its own. The values of the test tasks come from ``pipeline/testset/seen.json``, which
+Other measures compare parameters. The measures here are distances in cm, shares of a view, grey levels and numbers of
+words; each axis defines its own. The values of the test tasks come from ``pipeline/testset/seen.json``, which
 ``benchmarks/test_tasks_seen.py`` generates by running them, and from the benchmark's files.
 """
 
@@ -49,13 +49,13 @@ class Spread(NamedTuple):
 
 
 def spread(values: ArrayLike) -> Spread:
-    """Compute the percentiles of at least one value."""
+    """Compute the percentiles of one or more values."""
     measured = np.asarray(values, float)
     return Spread(measured.size, *(round(float(q), 4) for q in np.percentile(measured, [10, 50, 90])))
 
 
 class Share(NamedTuple):
-    """The share of ``number`` things, such as scenes, for which a statement is true."""
+    """The share of ``number`` items, such as scenes, that have a property."""
 
     number: int
     share: float
@@ -65,7 +65,7 @@ class Share(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """A visible effect of an axis, for the test tasks and the run; `None` without anything to measure."""
+    """A visible effect of an axis in the test tasks and in the run; `None` without a measured value."""
 
     axis: str
     what: str
@@ -100,11 +100,11 @@ def measure(run: Run, test: TestSet) -> list[Measure]:
 
 
 def clean_measures(look: Look) -> dict[str, float]:
-    """Return the measures of an unperturbed episode, by its first look."""
+    """Return the measures of an unperturbed episode, computed from its first observation."""
     return {
-        f"{CLEAN}: gripper at the first look (mm)": look.gripper_mm,
-        f"{CLEAN}: hand's speed at the first look (cm/s)": look.hand_cm_s,
-        f"{CLEAN}: fastest object at the first look (cm/s)": look.object_cm_s,
+        f"{CLEAN}: width of the gripper in the first observation (mm)": look.gripper_mm,
+        f"{CLEAN}: speed of the hand in the first observation (cm/s)": look.hand_cm_s,
+        f"{CLEAN}: speed of the fastest object in the first observation (cm/s)": look.object_cm_s,
     }
 
 

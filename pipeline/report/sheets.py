@@ -36,7 +36,7 @@ LONGEST_CAPTION = 10
 """Largest number of lines; further text is left out, and the manifest has all of it."""
 
 PAIR_SIDE_PX = 192
-HEADER = "in each pair: the clean twin on the left, the perturbed episode on the right"
+HEADER = "in each pair, the clean twin on the left and the perturbed episode on the right"
 MOMENT = 0.35
 """Share of the episode after which it is shown: the arm is in view, and the objects are not moved together yet."""
 
@@ -56,7 +56,7 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
     """Write one sheet for each perturbed axis of a run.
 
     Args:
-        folder: folder of the pictures, one ``<axis>.png`` for each axis with a kept episode that has a twin to show.
+        folder: folder of the pictures, one ``<axis>.png`` for each axis with a kept episode whose clean twin is stored.
     """
     twin_ids = twins(manifest).keys()
     perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed" and row["twin_id"] in twin_ids]

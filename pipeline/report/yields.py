@@ -10,14 +10,14 @@ from pipeline.run.counts import Counts, Rows, Target, named, tally
 
 
 class Cell(NamedTuple):
-    """A table's entry, and the share of a whole that a bar behind it shows, `None` for no bar."""
+    """An entry of a table, and the share that a bar below it shows; `None` for no bar."""
 
     text: str
     share: float | None = None
 
 
 class Table(NamedTuple):
-    """A table; the first column names the rows."""
+    """A table whose first column has the names of the rows."""
 
     title: str
     head: tuple[str, ...]
@@ -28,23 +28,23 @@ def tables(tried: Rows) -> list[Table]:
     """Tabulate yields by suite and by level, drop reasons, and replay modes.
 
     Args:
-        tried: the episodes that were tried, with reserves only if they were needed.
+        tried: the planned episodes, without reserves that were not needed.
     """
     return [
         by_suite(tried),
-        by_level("kept of planned, by level", tried),
-        _by_axis("dropped, by reason", [row for row in tried if not row["kept"]], "reason"),
-        _by_axis("kept, by how it was replayed", [row for row in tried if row["kept"]], "replay_mode"),
+        by_level("Kept/planned episodes, by level", tried),
+        _by_axis("Dropped episodes, by reason", [row for row in tried if not row["kept"]], "reason"),
+        _by_axis("Kept episodes, by replay mode", [row for row in tried if row["kept"]], "replay_mode"),
     ]
 
 
 def wanted_and_kept(targets: Mapping[str, Target]) -> Table:
-    """Tabulate the kept episodes of each axis next to the number that the configuration wants."""
+    """Tabulate the wanted and the kept episodes of each axis."""
     body: list[tuple[Cell, ...]] = []
     for axis, target in targets.items():
         share = min(1.0, target.kept / target.wanted) if target.wanted else None
         body.append((Cell(axis), Cell(f"{target.wanted:,}"), Cell(f"{target.kept:,}", share)))
-    return Table("wanted and kept", ("axis", "wanted", "kept"), body)
+    return Table("Wanted and kept episodes", ("axis", "wanted", "kept"), body)
 
 
 def by_suite(tried: Rows) -> Table:
@@ -56,7 +56,7 @@ def by_suite(tried: Rows) -> Table:
     for name, of in (*lines, ("all", {})):
         by_suites = [_kept(Counts.of(tried, suite=suite, **of)) for suite in suites]
         body.append((Cell(name), *by_suites, _kept(Counts.of(tried, **of))))
-    return Table("kept of planned, by suite", head, body)
+    return Table("Kept/planned episodes, by suite", head, body)
 
 
 def by_level(title: str, tried: Rows, axis: str | None = None) -> Table:

@@ -26,7 +26,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Counts:
-    """Numbers of the ``tried`` rows; ``planned - kept`` is the number of episodes that were lost."""
+    """Numbers of the ``tried`` rows; ``planned - kept`` is the number of dropped episodes."""
 
     planned: int
     replayed: int
@@ -74,21 +74,21 @@ def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
 
 
 def shortfalls(found: Mapping[str, Target]) -> list[str]:
-    """Write a sentence for each axis that has fewer kept episodes than wanted, with the setting that helps."""
+    """Write a sentence for each axis with fewer kept episodes than wanted, with the setting that adds episodes."""
     sentences = []
     for axis, target in found.items():
         if axis == CLEAN or target.kept >= target.wanted:
             continue
         if target.planned < target.wanted:
-            remedy = f"only {target.planned} could be planned: use more demonstrations, or wider ranges"
+            remedy = f"only {target.planned} could be planned: use more demonstrations or wider ranges"
         else:
-            remedy = "raise plan.reserve, which adds candidates and keeps what is finished"
+            remedy = "raise plan.reserve, which adds candidates and keeps all finished work"
         sentences.append(f"{axis}: {target.kept} of {target.wanted} wanted episodes are kept; {remedy}")
     return sentences
 
 
 def beyond_step_limit(rows: Rows) -> list[str]:
-    """Report the kept episodes that take more steps than an evaluation allows; empty if there are none."""
+    """Report the kept episodes with more steps than an evaluation allows; empty without such episodes."""
     beyond = [row for row in rows if row["kept"] and row["exceeds_step_limit"]]
     if not beyond:
         return []
@@ -103,7 +103,7 @@ def beyond_step_limit(rows: Rows) -> list[str]:
 def tried(rows: Rows) -> list[Mapping[str, Any]]:
     """Return all rows except unneeded reserves and rows that ``export.where`` leaves out.
 
-    Rows that ``export.where`` leaves out are never kept, so their losses alone would give a wrong yield.
+    Rows that ``export.where`` leaves out are never kept. Counting only their losses would make the yield wrong.
     """
     return [row for row in rows if row["reason"] != NOT_NEEDED and row["chosen"]]
 
@@ -111,8 +111,8 @@ def tried(rows: Rows) -> list[Mapping[str, Any]]:
 def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
     """Map the episode ids of the clean twins of kept episodes to their rows.
 
-    Only twins that were kept, or that ``export.where`` alone leaves out, are returned: their trajectories and frames
-    are stored.
+    A clean twin is returned if it was kept, or if only ``export.where`` excludes it. Its trajectory and frames are then
+    stored.
     """
     wanted = {row["twin_id"] for row in rows if row["kept"]}
     stored = [row for row in rows if row["reason"] in MADE]
@@ -159,7 +159,7 @@ def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:
 
 
 def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
-    """Return the counts by axis and suite as a table for people, with totals and wanted episodes.
+    """Return the counts by axis and suite as a table for the terminal, with totals and wanted episodes.
 
     Args:
         episodes: ``plan.episodes``.
@@ -175,7 +175,7 @@ def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
     for axis in axes:
         cells = [Counts.of(rows, axis=axis, suite=suite) for suite in suites]
         in_all = Counts.of(rows, axis=axis)
-        # A combination's name may break behind a +.
+        # The name of a combination may break after a +.
         table.add_row(axis.replace("+", "+ "), *map(str, cells), str(in_all), str(target_of[axis].wanted))
     wanted = sum(target.wanted for target in target_of.values())
     totals = [Counts.of(rows, suite=suite) for suite in suites]

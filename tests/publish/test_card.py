@@ -38,9 +38,9 @@ def data(tmp_path: Path) -> Path:
 
 
 def test_other_formats_are_named_where_there_are_any(data: Path) -> None:
-    assert "the same episodes exist as LeRobot and LeRobot v2.1,\njoined by `episode_id`." in written(data, "rlds")
+    assert "the same episodes exist as LeRobot and LeRobot v2.1, with the same\n`episode_id`." in written(data, "rlds")
     alone = written(data, "rlds", ExportConfig.model_validate({"rlds": RldsConfig(name=NAME), "lerobot": None}))
-    assert "This repository holds the RLDS form. `manifest.parquet` has" in alone
+    assert "This repository has the RLDS format. `manifest.parquet` has" in alone
 
 
 @pytest.mark.parametrize("kind", OPTIONS.formats)
@@ -60,7 +60,7 @@ def test_tables_say_what_the_manifest_says(data: Path) -> None:
     assert cells(text, "camera", "Episodes") == ["1", "1", "2", "0"]
     assert cells(text, "layout", "Episodes") == ["1", "0", "1", "0"]
     assert cells(text, "**all**", "Episodes") == ["5", "2", "7", "0"]
-    levels = text.partition("By strength")[2]
+    levels = text.partition("by level, from 1")[2]
     assert "| camera | 0 | 0 | 0 | 3 | 0 |" in levels
     assert "| background | 0 | 2 | 0 | 0 | 0 |" in levels
     assert f"{CAMERA.component} (3)" in text
@@ -121,20 +121,20 @@ def test_conventions_and_commands_are_the_formats_own(
     for names in (SCHEMA.state.names, SCHEMA.action.names):
         assert ", ".join(names) in text
     view = "`image`" if kind == "rlds" else "`observation.images.image`"
-    assert f"relative to the scene's own. Changes {view}." in text
-    assert ("1 opens and 0 closes." if kind == "lerobot_v21" else "-1 opens and 1 closes, as LIBERO has it.") in text
+    assert f"relative to the scene's own. It changes {view}." in text
+    assert ("1 opens and 0 closes." if kind == "lerobot_v21" else "-1 opens and 1 closes, as in LIBERO.") in text
     assert f"train --with {client}" in text
     assert f"train --with {other}" not in text
 
 
 def test_a_failed_check_is_not_hidden(data: Path) -> None:
-    assert "The run's datasets were opened again and checked, and passed" in written(data, "rlds")
+    assert "The run's datasets were read back and passed all checks" in written(data, "rlds")
     failed = VALIDATION | {"rotation": {"checked": 7, "findings": ["episode 3 stands upside down"]}}
     (data / "validation.json").write_text(json.dumps(failed))
     text = written(data, "rlds")
     assert "**rotation failed**" in text
     assert cells(text, "rotation", "Conventions") == ["7", "1 findings, such as: episode 3 stands upside down"]
-    assert "and passed" not in text
+    assert "passed all checks" not in text
 
 
 LEROBOT_COLUMNS = [f"camera.{view}.{name}" for view in ("agent", "wrist") for name in ("depth", "segmentation")]
@@ -194,7 +194,7 @@ def test_what_was_not_compared_is_counted(data: Path) -> None:
     text = written(data, "rlds")
     distance = cells(text, "axis", "Distance to the LIBERO-Plus test set")
     assert cells(text, "camera", "Distance to the LIBERO-Plus test set")[distance.index("not_compared")] == "3"
-    assert "`unknown` means that no row could be compared, `disjoint where compared` that some could not." in text
+    assert "`unknown` means that no row could be compared; `disjoint where compared` means that some could not" in text
 
 
 def test_each_kind_of_an_axis_is_described_with_its_own_components(data: Path) -> None:
@@ -213,4 +213,4 @@ def test_the_command_that_makes_an_episode_again_has_the_demonstrations(data: Pa
     assert "--manifest manifest.parquet --demos DIR --out again\n" in text
     assert "demos expand" not in text
     write_rows(data, [one | {"demo_origin": "expanded"} for one in ROWS], "hdf5")
-    assert "the very files that `demos expand` wrote" in written(data, "rlds")
+    assert "the same files that `demos expand` wrote" in written(data, "rlds")

@@ -47,8 +47,8 @@ def test_demonstrations_of_own_tasks_are_not_attributed_to_libero(data: Path) ->
     assert "source_datasets" not in metadata
     for claim in ("Liu, Zhu", "yifengzhu-hf", "human", "LIBERO demonstration", "LIBERO's wording", "[CC BY 4.0]"):
         assert claim not in text
-    assert "1 recorded demonstrations of 1 tasks went in" in text
-    assert "**Demonstrations and tasks of my_suite**: of whoever published this dataset" in text
+    assert "The dataset derives from 1 recorded demonstrations of 1 tasks." in text
+    assert "**Demonstrations and tasks of my_suite**: by the publisher of this dataset" in text
     # Beside LIBERO's, both are named.
     write_rows(data, [*own, row("clean", task=STOVE)], "hdf5")
     text = written(data, "lerobot")
@@ -64,7 +64,7 @@ def test_only_the_starter_sets_demonstrations_are_called_human(data: Path) -> No
     write_rows(data, ROWS, "hdf5")
     text = written(data, "rlds")
     assert "2 recorded demonstrations of 2 tasks" in text
-    assert "Whether the publisher's files are LIBERO's own was not checked." in text
+    assert "It was not checked that the publisher's files are LIBERO's own." in text
     assert metadata_of(text)["license"] == "cc-by-4.0"
 
 
@@ -72,10 +72,10 @@ def test_rewrites_of_another_bank_are_not_licensed(data: Path) -> None:
     shipped = deal(STOVE)[0]
     write_rows(data, [row("clean", task=STOVE), row("language", shipped, task=STOVE)])
     text = written(data, "rlds")
-    assert "that made this dataset are under MIT.\n" in text
+    assert "that generated this dataset are under MIT.\n" in text
     assert metadata_of(text)["license"] == "cc-by-4.0"
     own = LanguagePerturbation(component="paraphrase", level=1, text="please turn that stove on for me")
     write_rows(data, [row("clean", task=STOVE), row("language", own, task=STOVE)])
     text = written(data, "rlds")
-    assert "others are of\n  whoever published it, and their licence is not known here." in text
+    assert "others are by\n  the publisher of this dataset, and their licence is unknown." in text
     assert metadata_of(text)["license"] == "other"

@@ -171,7 +171,7 @@ def test_asks_for_a_token(hub: Hub, made: Path, tmp_path: Path, monkeypatch: pyt
 
 def test_a_token_that_may_not_write_is_told_apart(hub: Hub, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_TOKEN", "reader")
-    with pytest.raises(PipelineError, match="does not let you write"):
+    with pytest.raises(PipelineError, match="your token may not write to"):
         send(prepare(made, "rlds"), REPOSITORY)
 
 
@@ -233,7 +233,7 @@ def test_another_dataset_stays_until_it_is_to_be_replaced(
 
     told = compare(upload, REPOSITORY, replace=True).splitlines()
     gone = before.keys() - upload.files.keys() - {UPLOAD, ".gitattributes"}
-    assert told == [f"{REPOSITORY} (public) has {len(before) - 1} files; deleted: {len(gone)}"] + [
+    assert told == [f"{REPOSITORY} (public) has {len(before) - 1} files; the upload would delete {len(gone)}"] + [
         f"  {path}" for path in sorted(gone)
     ]
     assert hub.files == before
@@ -311,7 +311,7 @@ def test_a_commit_of_somebody_else_meanwhile_stops_the_upload(hub: Hub, made: Pa
         hub.commits += 1
 
     hub.before_commit = commit
-    with pytest.raises(PipelineError, match="has changed, or was created, since it was read"):
+    with pytest.raises(PipelineError, match="has changed or was created since it was read"):
         send(replace(upload, run="tiny_run", tag="v1", others={"README.md": upload.others["README.md"]}), REPOSITORY)
     assert uploaded(hub) == {**expected(upload), "notes.md": b"theirs"}
 
@@ -320,7 +320,7 @@ def test_a_commit_of_somebody_else_meanwhile_stops_the_upload(hub: Hub, made: Pa
 def test_a_file_that_changes_before_it_is_sent_is_not_sent(hub: Hub, data: Path, name: str) -> None:
     upload = prepare(data, "lerobot")
     (data / name).write_text("a secret")
-    with pytest.raises(PipelineError, match=rf"{re.escape(name)}: has changed since it was checked"):
+    with pytest.raises(PipelineError, match=rf"{re.escape(name)}: the file has changed since it was checked"):
         send(upload, REPOSITORY)
     assert (hub.commits, hub.sent) == (0, [])
 
@@ -333,7 +333,7 @@ def test_a_file_that_changes_while_it_is_sent_is_noticed(hub: Hub, data: Path, n
         (data / name).write_bytes((data / name).read_bytes()[::-1])
 
     hub.before_transfer = exchange
-    with pytest.raises(PipelineError, match=r"not as recorded, such as meta/info\.json|file that does not exist"):
+    with pytest.raises(PipelineError, match=r"their record, such as meta/info\.json|file that does not exist"):
         send(upload, REPOSITORY)
 
 
@@ -366,7 +366,7 @@ def test_the_command_says_all_of_it_and_sends_it_when_asked(hub: Hub, data: Path
             *("leakage.json", "validation.json", "dataset_statistics.json"),
         ]
     )
-    assert f"{REPOSITORY} is not there" in lines[-2]
+    assert f"{REPOSITORY} does not exist or is hidden" in lines[-2]
     done = push("--really", "--private")
     assert done.returncode == 0, done.stderr
     assert (hub.private, json.loads(hub.files[UPLOAD])["format"]) == (True, "lerobot")
@@ -378,4 +378,4 @@ def test_the_command_says_all_of_it_and_sends_it_when_asked(hub: Hub, data: Path
 
 def test_without_a_network_the_files_are_still_named(hub: Hub, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
-    assert "not known what" in compare(prepare(made, "rlds"), REPOSITORY)
+    assert "its deleted files are unknown" in compare(prepare(made, "rlds"), REPOSITORY)

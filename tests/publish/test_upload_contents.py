@@ -153,10 +153,10 @@ def rotten(data: Path) -> None:
         (vacuous, "at least one check"),
         (exported_since, r"validation\.json: older than .*info\.json"),
         (validated_since, r"validation\.json: is a link, or has changed"),
-        (without_card, r"README\.md: not there"),
-        (foreign, r"1 files that are not of the dataset.*passwords\.txt"),
-        (hidden, r"not of the dataset.*\.cache/note"),
-        (elsewhere, r"1 that lie elsewhere, such as tiny/meta/stats\.json"),
+        (without_card, r"README\.md: the card is missing"),
+        (foreign, r"1 foreign files and 0 links.*passwords\.txt"),
+        (hidden, r"1 foreign files.*\.cache/note"),
+        (elsewhere, r"1 links to files elsewhere, such as tiny/meta/stats\.json"),
         (folder_elsewhere, "such as tiny/more"),
         (key_in_card, r"card: 1 files are not as they were generated: lerobot/\.env \(added\)"),
         (key_in_finetune, r"finetune: .*: wandb_key\.json \(added\)"),
@@ -168,7 +168,7 @@ def rotten(data: Path) -> None:
         (edited_recipe, r"finetune\.yaml \(changed\)"),
         (report_exchanged, r"leakage\.json: is a link, or has changed"),
         (report_elsewhere, r"leakage\.json: is a link, or has changed"),
-        (incomplete, r"lacks 1 files, such as tiny/videos/.*\.mp4"),
+        (incomplete, r"1 files are missing, such as tiny/videos/.*\.mp4"),
     ],
 )
 def test_refuses(data: Path, spoil: Callable[[Path], None], complaint: str) -> None:
@@ -201,6 +201,6 @@ def test_passes_by_the_statistics_that_openvla_oft_leaves_in_rlds(data: Path) ->
 
 def test_refuses_what_else_training_left_in_rlds(data: Path) -> None:
     (data / "rlds" / SET / "1.0.0" / "loss.csv").write_text("1,2")
-    with pytest.raises(PipelineError, match=r"not of the dataset.*loss\.csv") as caught:
+    with pytest.raises(PipelineError, match=r"1 foreign files.*loss\.csv") as caught:
         prepare(data, "rlds")
-    assert "move them away" in str(caught.value)
+    assert "move them to another folder" in str(caught.value)

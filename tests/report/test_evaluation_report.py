@@ -223,7 +223,7 @@ def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) ->
             assert line["difference"]["resampled"] in words
     assert "ran the same 60 episodes" in words
     assert words.count("better (first) and worse (second)") == 2
-    assert words.count("by bootstrap: it is computed 10,000 times") == 1, "explained once"
+    assert words.count("a p-value from 10,000 bootstrap resamples") == 1, "explained once"
     failures = found["failures"]
     axes = {(failure["policy"], failure["source"], failure["axis"]) for failure in failures}
     assert len(failures) <= FAILURES * len(axes)
@@ -233,14 +233,14 @@ def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) ->
 
 def test_the_overall_rate_of_each_policy_comes_first(written: Path) -> None:
     words = " ".join(Page(written.read_text()).text.split())
-    top = words[words.index("Evaluation of 2 policies") : words.index("Beside published models")]
+    top = words[words.index("Evaluation of 2 policies") : words.index("Comparison with published models")]
     # Of 70 episodes every fourth fails, or is solved; intervals as of Wilson's formula in SciPy.
     for name, solved in (("better", 52), ("worse", 18)):
         low, high = binomtest(solved, 70).proportion_ci(method="wilson")
         shown = f"{name} {100 * solved / 70:.1f} % {100 * low:.0f} to {100 * high:.0f} % (95 % interval)"
         assert f"{shown} {solved} of 70 episodes" in top
     assert "did not run the same episodes" not in top
-    assert "Bars below figures: successes failures" in top
+    assert "Bars below numbers: successes failures" in top
 
 
 def test_one_policy_of_few_episodes_is_not_set_beside_published_ones_as_an_equal(
@@ -265,7 +265,7 @@ def test_policies_of_different_episodes_are_said_to_be(subset: list[EvaluationTa
     other = write(tmp_path / "other", [result(task, False, "other") for task in subset[5:20]])
     evaluation_report.write(read([one, other]), tmp_path / "report.html")
     words = " ".join(Page((tmp_path / "report.html").read_text()).text.split())
-    assert "The policies did not run the same episodes" in words[: words.index("Beside published models")]
+    assert "The policies did not run the same episodes" in words[: words.index("Comparison with published models")]
     assert "15 are common to all" in words
 
 
@@ -278,5 +278,5 @@ def test_a_browser_shows_it(written: Path, width_px: int) -> None:
 
 
 def test_the_page_has_the_name_of_a_page(tmp_path: Path) -> None:
-    with pytest.raises(PipelineError, match="not the name of a page"):
+    with pytest.raises(PipelineError, match="the report is an HTML page"):
         evaluation_report.write([], tmp_path / "report.json")

@@ -227,9 +227,9 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
     sheet = preview.axis_sheet(stage, "lift", STARTER, NO_TESTS)
     assert captions[1:] == [
         "lamp, level 1",
-        "refused, too_high: lamp, level 5",
+        "rejected, too_high: lamp, level 5",
         "window, level 1",
-        "refused, too_high: window, level 5",
+        "rejected, too_high: window, level 5",
     ]
     original, *variants = tiles(sheet, 2)
     assert [(variant == preview.REFUSED_GREY).all() for variant in variants[:4]] == [False, True, False, True]
@@ -319,7 +319,7 @@ def test_an_overview_shows_a_draw_of_a_middle_level_that_the_scene_takes(
     monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(5,)))
     captions.clear()
     preview.overview(stage, STARTER, NO_TESTS)
-    refused = {f"refused, too_high: lift: {component}, level 5" for component in ("lamp", "window")}
+    refused = {f"rejected, too_high: lift: {component}, level 5" for component in ("lamp", "window")}
     assert len(captions) == 1 + len(Axes.model_fields)
     assert set(captions[1:]) <= refused
     # No paraphrase of the task is of level 5, as no task of libero_90 has rewrites.
@@ -444,4 +444,4 @@ def test_an_axis_without_a_draw_for_the_first_task_is_said_on_its_sheet(
     )
     preview.for_run(config, tmp_path / "previews", loop)
     assert {file.name for file in (tmp_path / "previews" / PLATE.suite).iterdir()} == {"pose.png", "language.png"}
-    assert captions.count("no draw of pose keeps clear of the test set here") == 1
+    assert captions.count("no perturbation of pose keeps its clearance to the test set in this task") == 1

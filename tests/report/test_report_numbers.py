@@ -35,7 +35,7 @@ TRACKED = row("tracked", "robot", 2980, replay_mode="tracked", task="another")
 
 def test_the_headline_is_of_what_is_kept() -> None:
     assert report._headline([TWIN, PUSHED, LOST, TRACKED], [TWIN, PUSHED, TRACKED]) == {
-        **{"planned": "4", "replayed": "4", "kept": "3", "twins among them": "1", "tasks": "2"},
+        **{"planned": "4", "replayed": "4", "kept": "3", "kept clean twins": "1", "tasks": "2"},
         # 9,100 steps of 50 ms.
         **{"steps": "9,100", "minutes at 20 Hz": "8"},
     }
@@ -62,7 +62,7 @@ def test_own_motion_is_beside_that_of_the_twins() -> None:
 
 
 def test_an_episode_is_longer_by_the_steps_that_its_twin_has_fewer() -> None:
-    expected = figures.strips("longer than the twin by", {"robot": {"robot": np.array([120.0, -20.0])}}, "steps")
+    expected = figures.strips("Difference from the clean twin", {"robot": {"robot": np.array([120.0, -20.0])}}, "steps")
     rows = [TWIN, PUSHED, TRACKED]
     assert report._lengths(rows, rows)[-1] == expected
 
@@ -101,13 +101,13 @@ def test_a_draw_lies_where_its_parameters_say() -> None:
     camera = CameraPerturbation(component="spherical", level=1, azimuth_deg=10, elevation_deg=3, yaw_deg=4, pitch_deg=7)
     stands, _, turned = coverage.plot_axis("camera", [KeptPerturbation(BOWL, camera, None)], TestSet(())).panels
     groups = [{"benchmark": nothing, "camera": np.array([at])} for at in ([10.0, 3.0], [4.0, 7.0])]
-    assert stands == figures.scatter("where it stands", groups[0], "azimuth (°)", "elevation (°)")
-    assert turned == figures.scatter("how it is turned in place", groups[1], "yaw (°)", "pitch (°)")
+    assert stands == figures.scatter("Position", groups[0], "azimuth (°)", "elevation (°)")
+    assert turned == figures.scatter("Rotation in place", groups[1], "yaw (°)", "pitch (°)")
     offsets_rad = (0.1, 0.2, -0.1, 0.0, 0.05, 0.3, -0.2)
     robot = RobotPerturbation(component="initial_joints", level=1, joint_offsets_rad=offsets_rad)
     rows = {f"joint {n}": {"benchmark": nothing[:, 0], "robot": np.array([x])} for n, x in enumerate(offsets_rad, 1)}
     *_, joints = coverage.plot_axis("robot", [KeptPerturbation(BOWL, robot, None)], TestSet(())).panels
-    assert joints == figures.strips("offset by joint, base to wrist", rows, "rad")
+    assert joints == figures.strips("Offset of each joint, from base to wrist", rows, "rad")
 
 
 @pytest.mark.parametrize(("values", "share"), [([10.5, 10.5, 10.5], 1.0), ([10.5, 11.5, 12.5], 0.35)])

@@ -89,7 +89,7 @@ def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
     kept: list[KeptPerturbation[Any]] = [KeptPerturbation(MILK, change, None) for change in moving]
     assert [cm for _, cm in PoseAxis.observe_together(kept, test)] == pytest.approx([1, 0, 2, 0, 0, 0])
     between_cm = 100 * np.linalg.norm(draws[0]["milk_1"] + away - draws[1]["milk_1"] - [[0, 0], 2 * away], axis=1)
-    nearest_cm = [cm for what, cm in PoseAxis.observe_tests(test) if what.endswith("to the nearest other (cm)")]
+    nearest_cm = [cm for what, cm in PoseAxis.observe_tests(test) if what.endswith("to its nearest placement (cm)")]
     assert nearest_cm == pytest.approx([between_cm.min(), 0, 2, 0, 2, 0])
 
 
@@ -97,13 +97,13 @@ def test_what_a_test_shows_is_measured_in_its_own_scene() -> None:
     """0.3 m along x is on the camera's side, from 0.19 m on; the camera stands 0.36 m further, and 0.71 m above."""
     places = {"positions": "0.3,0;-0.1,0.2", "category": "ketchup,ketchup", "arena": "tabletop"}
     added = [*LayoutAxis.observe_tests(TestSet((TestTask(MILK.suite, MILK.name, "a", "layout", "objects", places),)))]
-    assert [shown for what, shown in added if what == "object on the camera's side"] == [True, False]
-    away_m = [shown for what, shown in added if what == "object to camera (m)"]
+    assert [shown for what, shown in added if what == "objects on the camera's side"] == [True, False]
+    away_m = [shown for what, shown in added if what == "distance from an added object to the camera (m)"]
     assert away_m == pytest.approx([math.hypot(0.36, 0.71), math.hypot(0.76, 0.2, 0.71)])
     moved: dict[str, str | int] = {"moves": "milk_1:0.03,-0.04;basket_1:1,1", "level": 2}
     moves = TestSet((TestTask(MILK.suite, MILK.name, "b", "pose", "pose", moved),))
     ((what, shift_cm),) = PoseAxis.observe_tests(moves)
-    assert what == "target of libero_object moved, level 2 (cm)"
+    assert what == "displacement of the target in libero_object, level 2 (cm)"
     assert shift_cm == pytest.approx(5)
 
 
@@ -159,7 +159,7 @@ def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: 
         for row in rows
         if row["role"] == "twin"
     ]
-    gripper = measures["clean", "gripper at the first look (mm)"]
+    gripper = measures["clean", "width of the gripper in the first observation (mm)"]
     assert isinstance(gripper.ours, seen.Spread)
     assert gripper.ours.middle == pytest.approx(float(np.median(widths_mm)), abs=0.01)
     assert isinstance(gripper.tested, seen.Spread)
@@ -167,16 +167,18 @@ def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: 
     assert 77 < gripper.tested.middle < 78
     noisy = {row["component"] for row in rows if row["axis"] == "noise"}
     assert {what.split()[0] for (axis, what), one in measures.items() if axis == "noise" and one.ours} == noisy
-    words = measures["language", "words"]
+    words = measures["language", "words in the instruction"]
     assert words.ours is not None
     assert words.ours.number == sum(row["axis"] == "language" for row in rows)
     assert words.tested is not None
     assert words.tested.number == 1537
-    assert measures["layout", "object on the camera's side"].ours is None
-    assert measures["layout", "scenes with 5 added"].tested == seen.Share(829, round(207 / 829, 4))
-    assert measures["layout", "scenes with 2 added that repeat a model"].tested == seen.Share(151, round(9 / 151, 4))
+    assert measures["layout", "objects on the camera's side"].ours is None
+    assert measures["layout", "scenes with 5 added objects"].tested == seen.Share(829, round(207 / 829, 4))
+    assert measures["layout", "scenes with 2 added objects and a repeated model"].tested == seen.Share(
+        151, round(9 / 151, 4)
+    )
     for suite in SUITES[:4]:
-        assert measures["pose", f"test's thing of interest in {suite} to the nearest other (cm)"].tested
+        assert measures["pose", f"distance of a test object in {suite} to its nearest placement (cm)"].tested
 
 
 def test_twins_that_are_left_out_are_still_compared_with(
