@@ -66,12 +66,15 @@ def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
     try:
         content = json.loads(file.read_bytes())
         if not isinstance(content, dict):
-            raise TypeError(f"holds {type(content).__name__}")
+            raise TypeError(f"it contains {type(content).__name__}")
     except FileNotFoundError as error:
-        raise PipelineError("not there", where=file, remedy=remedy) from error
+        raise PipelineError("the file is missing", where=file, remedy=remedy) from error
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise PipelineError(
-            f"damaged ({error})", where=file, expected="a JSON object", remedy=f"move it away, and {remedy}"
+            f"the file is damaged ({error})",
+            where=file,
+            expected="a JSON object",
+            remedy=f"move it to another place, and {remedy}",
         ) from error
     return content
 
@@ -99,10 +102,10 @@ def refuse_other_file(path: Path, mark: str) -> None:
     if not os.path.lexists(path) or (path.is_file() and mark.encode() in path.read_bytes()):
         return
     raise PipelineError(
-        "is another file, and would be overwritten",
+        "the command did not write this file, and would overwrite it",
         where=path,
         expected="a new name, or a file that the same command wrote",
-        remedy="name another file, or move this one",
+        remedy="choose another name, or move the file to another place",
     )
 
 
@@ -165,7 +168,7 @@ def keep_below(folder: Path, files: set[Path], made: Callable[[Path], bool] = la
     Deleted files are, for example, shards of an earlier plan, and temporaries of a killed run.
 
     Args:
-        made: returns True if this project wrote a file. All other files stay.
+        made: function that returns True for a file of this project. All other files stay.
     """
     if not folder.is_dir():
         return

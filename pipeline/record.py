@@ -1,4 +1,4 @@
-"""Record of finished work: what it was generated from, what generated it, and its files.
+"""Record of finished work: its inputs, the recipes and versions that generated it, and its files.
 
 Every part of this project that skips finished work asks such a record whether the work is up to date: the files of the
 stores, the datasets, the outputs of the stages, and the results of an evaluation.
@@ -68,7 +68,7 @@ class Record:
         if not self.same_request(basis):
             names = list(_changed(self.basis.requested, basis.requested))
             further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-            return f"other {', '.join(names[:NAMED])}{further}"
+            return f"changed {', '.join(names[:NAMED])}{further}"
         return differences(self.basis.made_with, basis.made_with, unnamed)
 
 

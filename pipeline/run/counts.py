@@ -82,7 +82,7 @@ def shortfalls(found: Mapping[str, Target]) -> list[str]:
         if target.planned < target.wanted:
             remedy = f"only {target.planned} could be planned: use more demonstrations, or wider ranges"
         else:
-            remedy = "raise plan.reserve, which adds candidates and keeps what is finished"
+            remedy = "raise plan.reserve, which adds candidates and keeps finished work"
         sentences.append(f"{axis}: {target.kept} of {target.wanted} wanted episodes are kept; {remedy}")
     return sentences
 
@@ -111,8 +111,8 @@ def tried(rows: Rows) -> list[Mapping[str, Any]]:
 def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
     """Map the episode ids of the clean twins of kept episodes to their rows.
 
-    Only twins that were kept, or that ``export.where`` alone leaves out, are returned: their trajectories and frames
-    are stored.
+    Only clean twins that were kept, or that ``export.where`` alone leaves out, are returned: their trajectories and
+    frames are stored.
     """
     wanted = {row["twin_id"] for row in rows if row["kept"]}
     stored = [row for row in rows if row["reason"] in MADE]
@@ -128,7 +128,7 @@ def origins(rows: Rows, source: str) -> Counter[str]:
     """Count the demonstrations of some rows by origin: ``human``, ``recorded`` or ``expanded``.
 
     Args:
-        source: source of the run's demonstrations. An HDF5 file does not state if a person or a policy recorded it.
+        source: source of the run's demonstrations. An HDF5 file does not state if a person or a policy acted in it.
     """
     origin_of = {row["demo_id"]: row["demo_origin"] for row in rows}
     numbers = Counter(origin_of.values())

@@ -1,4 +1,4 @@
-"""Loader that joins the plan and the rendered streams to the Episode that a writer puts into a dataset."""
+"""Loader that joins the plan and the rendered streams to an ``Episode``, which a writer puts into a dataset."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -153,9 +153,9 @@ def rendered(row: plan.Row, frames: Mapping[str, StoredFrames]) -> bool:
 def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
     if missing:
         raise PipelineError(
-            f"what the plan needs is missing, damaged or not current in {len(missing)} places, such as this one",
+            f"{len(missing)} files or folders that the plan needs are missing, damaged or outdated, such as this one",
             where=missing[0],
-            remedy=f"`{MAKE_AGAIN}`, or python stages/{stage}.py CONFIG: makes only those",
+            remedy=f"run `{MAKE_AGAIN}`, or `python stages/{stage}.py CONFIG` for this stage alone",
         )
 
 
@@ -179,5 +179,5 @@ def outdated(
     numbers: Counter[str] = Counter()
     for kind, reasons in by_kind.items():
         for reason, number in reasons.items():
-            numbers[f"{kind}, made with {reason}"] += number
+            numbers[f"{kind}, generated with {reason}"] += number
     return numbers

@@ -46,10 +46,11 @@ class RenderJob:
         device = gl.choose().device
         if device != self.device:
             raise PipelineError(
-                f"this worker renders with {device}, the run with {self.device}",
+                f"this worker renders with {device}, but the run renders with {self.device}",
                 where=f"worker on {platform.node()}",
-                expected="one device for all frames of a run, as devices differ by some grey levels",
-                remedy="start the stage and every worker on machines that render alike (MUJOCO_GL picks the back end)",
+                expected="the same device for all frames of a run, as devices differ by some grey levels",
+                remedy="start the stage and every worker on machines with the same OpenGL device (MUJOCO_GL selects "
+                "the back end)",
             )
         trajectory = self._trajectory()
         parts, missing = self._stored()

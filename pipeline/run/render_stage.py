@@ -61,7 +61,7 @@ def render_plan(
     can from the stored trajectories.
 
     Returns:
-        The files of ``frames`` that the plan needs. They do not depend on what was rendered before.
+        The files of ``frames`` that the plan needs. They do not depend on earlier renderings.
 
     Raises:
         PipelineError: when rendering leaves the same work undone.
@@ -79,9 +79,9 @@ def render_plan(
             return set(needed)
         if missing.keys() == undone:
             raise PipelineError(
-                f"{len(missing)} files of frames were rendered and are still not there, such as this one",
+                f"{len(missing)} files of frames were rendered and are still missing, such as this one",
                 where=frames.path(next(iter(missing))),
-                expected=f"files written there by workers, rendered on {device}",
+                expected=f"files that workers write to this folder, rendered on {device}",
                 remedy="check that all workers see this folder and have the same versions and OpenGL device",
             )
         undone = set(missing)

@@ -128,14 +128,14 @@ class FrameStore(Store):
             frames, views = frames - frames_of_file, views - views_of_file
         if frames or views or not parts:
             raise PipelineError(
-                f"streams {sorted(frames | views)} were not rendered",
+                f"the streams {sorted(frames | views)} are not rendered",
                 where=self.folder(trajectory_id),
                 remedy="run the render stage again",
             )
         return merged(parts)
 
     def stored(self, trajectory_id: str, streams: Mapping[str, str], device: str) -> list[Rendered]:
-        """Read what up-to-date files hold of the named streams of a trajectory, each stream once.
+        """Read the named streams of a trajectory, as far as up-to-date files have them, each stream once.
 
         Args:
             streams: id of a stream to the id of its geometry.
@@ -179,7 +179,11 @@ class FrameStore(Store):
             with self.opened(name) as file:
                 if _members(file, "streams"):
                     return file.array("action"), file.array("state")
-        raise PipelineError("not rendered", where=self.folder(trajectory_id), remedy="run the render stage again")
+        raise PipelineError(
+            "the trajectory has no rendered frames",
+            where=self.folder(trajectory_id),
+            remedy="run the render stage again",
+        )
 
     def _files_of(self, trajectory_id: str) -> list[str]:
         return sorted(f"{trajectory_id}/{path.stem}" for path in self.folder(trajectory_id).glob(f"*{SUFFIX}"))
