@@ -69,9 +69,9 @@ def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verd
 def _counts(
     config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
 ) -> Table:
-    table = Table("axis", "wanted", "planned", "reach their goal", "rendered", title="episodes")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = Table("axis", title="episodes")
+    for head in ("wanted", "planned", "reach their goal", "rendered"):
+        table.add_column(head, justify="right", no_wrap=True)
     every = []
     for axis in ("clean", *config.plan.episodes):
         of_axis = [row for row in rows if row.axis == axis]
@@ -79,6 +79,7 @@ def _counts(
         planned = sum(row.wanted for row in of_axis)
         wanted, rendered = config.plan.episodes.get(axis, planned), sum(outcome.rendered(row, frames) for row in kept)
         every.append((wanted, planned, len(kept), rendered))
+        # The name of a combination may break after a +.
         table.add_row(axis.replace("+", "+ "), *map(str, every[-1]))
     table.add_section()
     table.add_row("all", *map(str, map(sum, zip(*every, strict=True))))

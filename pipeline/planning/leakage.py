@@ -218,15 +218,18 @@ def write(findings: dict[str, AxisDistance], path: Path) -> None:
 
 def report(findings: dict[str, AxisDistance]) -> Group:
     """Format the findings for people: two tables that fit 80 columns, and the definition of each distance."""
-    table = Table("axis", title="distance to the LIBERO-Plus test set", box=box.SIMPLE)
+    table = Table(title="distance to the LIBERO-Plus test set", box=box.SIMPLE, pad_edge=False)
+    table.add_column("axis", no_wrap=True)
     for column in ("episodes", "tests", "overlaps", "smallest", "clearance"):
-        table.add_column(column, justify="right")
-    table.add_column("verdict")
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("verdict", min_width=len("compared"))
     for axis, finding in findings.items():
         smallest = "-" if finding.smallest is None else f"{finding.smallest:.3g}"
         counts = [f"{count:,}" for count in (finding.rows, finding.test_tasks, finding.overlaps)]
         table.add_row(axis, *counts, smallest, f"{finding.clearance:g}", finding.verdict)
-    covered = Table("axis", "component", title="from each test task to the nearest wanted episode", box=box.SIMPLE)
+    covered = Table(
+        "axis", "component", title="distance from each test task to the nearest wanted episode", box=box.SIMPLE
+    )
     covered.caption = "-: the measure only distinguishes equal from different changes"
     for column in ("tests", "smallest", "median", "90 %", "largest"):
         covered.add_column(column, justify="right")

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Rows = Sequence[Mapping[str, Any]]
 """Rows of the manifest."""
 
+LONGEST_LINE = 40
+"""Largest width of the counts of all suites in one line of the table, which leaves room for the other columns."""
+
 
 @dataclass(frozen=True)
 class Counts:
@@ -80,9 +83,9 @@ def shortfalls(found: Mapping[str, Target]) -> list[str]:
         if axis == CLEAN or target.kept >= target.wanted:
             continue
         if target.planned < target.wanted:
-            remedy = f"only {target.planned} could be planned: use more demonstrations, or wider ranges"
+            remedy = f"only {target.planned} could be planned: use more demonstrations or wider ranges"
         else:
-            remedy = "raise plan.reserve, which adds candidates and keeps finished work"
+            remedy = "raise plan.reserve, which adds candidates and keeps all finished work"
         sentences.append(f"{axis}: {target.kept} of {target.wanted} wanted episodes are kept; {remedy}")
     return sentences
 
@@ -111,8 +114,8 @@ def tried(rows: Rows) -> list[Mapping[str, Any]]:
 def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
     """Map the episode ids of the clean twins of kept episodes to their rows.
 
-    Only clean twins that were kept, or that ``export.where`` alone leaves out, are returned: their trajectories and
-    frames are stored.
+    A clean twin is returned if it was kept, or if only ``export.where`` excludes it. Its trajectory and frames are then
+    stored.
     """
     wanted = {row["twin_id"] for row in rows if row["kept"]}
     stored = [row for row in rows if row["reason"] in MADE]
@@ -128,7 +131,7 @@ def origins(rows: Rows, source: str) -> Counter[str]:
     """Count the demonstrations of some rows by origin: ``human``, ``recorded`` or ``expanded``.
 
     Args:
-        source: source of the run's demonstrations. An HDF5 file does not state if a person or a policy acted in it.
+        source: source of the run's demonstrations. An HDF5 file does not state if a person or a policy recorded it.
     """
     origin_of = {row["demo_id"]: row["demo_origin"] for row in rows}
     numbers = Counter(origin_of.values())
@@ -159,26 +162,34 @@ def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:
 
 
 def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
-    """Return the counts by axis and suite as a table for people, with totals and wanted episodes.
+    """Return the counts by axis and suite as a table for the terminal, with totals and wanted episodes.
 
     Args:
         episodes: ``plan.episodes``.
     """
+    from rich import box
     from rich.table import Table
 
     suites, axes = named(rows, "suite"), named(tried(rows), "axis")
-    heads = [suite.replace("_", "_\n", 1) for suite in suites]  # Two lines fit into 80 columns.
+    heads = [suite.replace("_", "_\n", 1) for suite in suites]
     target_of = targets(rows, episodes)
-    table = Table("axis", *heads, "all", "wanted", title="planned/replayed/kept episodes")
-    for column in table.columns[1:]:
-        column.justify, column.no_wrap = "right", True
+    wanted = sum(target.wanted for target in target_of.values())
+    totals = [Counts.of(rows, suite=suite) for suite in suites]
+    # A cell with large numbers has three lines, and the name of a combination has a line for each axis. All columns
+    # then fit into 80 columns.
+    in_lines = len(suites) * (max(map(len, map(str, totals)), default=0) + 2) > LONGEST_LINE
+    table = Table("axis", title="planned/replayed/kept episodes", box=box.SIMPLE, pad_edge=False)
+    for head in (*heads, "all", "wanted"):
+        table.add_column(head, justify="right", no_wrap=True)
     for axis in axes:
         cells = [Counts.of(rows, axis=axis, suite=suite) for suite in suites]
         in_all = Counts.of(rows, axis=axis)
-        # A combination's name may break behind a +.
-        table.add_row(axis.replace("+", "+ "), *map(str, cells), str(in_all), str(target_of[axis].wanted))
-    wanted = sum(target.wanted for target in target_of.values())
-    totals = [Counts.of(rows, suite=suite) for suite in suites]
+        table.add_row(axis.replace("+", "+\n"), *_cells([*cells, in_all], in_lines), str(target_of[axis].wanted))
     table.add_section()
-    table.add_row("all", *map(str, totals), str(Counts.of(rows)), str(wanted))
+    table.add_row("all", *_cells([*totals, Counts.of(rows)], in_lines), str(wanted))
     return table
+
+
+def _cells(counts: Sequence[Counts], in_lines: bool) -> list[str]:
+    """Format counts for a table, in one line or in three lines."""
+    return [str(count).replace("/", "/\n") if in_lines else str(count) for count in counts]
