@@ -121,7 +121,7 @@ def test_only_files_as_recorded_are_handed_out(folder: Path, edit: Callable[[Pat
     edit(folder)
     with pytest.raises(PipelineError) as caught:
         unchanged(folder)
-    assert EDITS[edit] in str(caught.value) or ".generated.json: not there" in str(caught.value)
+    assert EDITS[edit] in str(caught.value) or ".generated.json: the file is missing" in str(caught.value)
 
 
 KILLED = """

@@ -29,10 +29,21 @@ from pipeline.testset.benchmark import TestTask
 
 
 class Axes(Frozen):
-    """The axes that a run draws from; an axis left out is not drawn.
+    """Axes that a run samples from; an axis that is left out is not sampled.
 
-    They are listed in the order in which their perturbations apply, deepest layer first. Objects are added where a
-    demonstration's scene leaves room, then the target and the arm move, and are refused where they meet an object.
+    They are listed in the order in which their perturbations apply, deepest layer first. Objects are added first, at
+    free places of a demonstration's scene. Then the target and the arm move, and are rejected if they touch an object.
+
+    Attributes:
+        layout: Objects that are added to the scene.
+        pose: Displaced and turned objects of the scene.
+        robot: Posture in which the arm starts, or to which the controller pulls it.
+        disturbance: Pushes on the hand during the episode.
+        camera: Pose of the agent view's camera.
+        light: Colour, direction, gloss and shadows of the lamps.
+        background: Materials of the room and of the working surface.
+        noise: Corruptions of the frames.
+        language: Rewrites of the instruction.
     """
 
     layout: LayoutAxis | None = None

@@ -118,16 +118,17 @@ class LayoutPerturbation(PhysicsPerturbation):
 class LayoutAxis(Axis):
     """Number and sources of added objects.
 
-    The level is the number of objects, 1 to 5 as in LIBERO-Plus. An object is never of a category that is in the scene
-    already or that the instruction names, nor of one that the test set adds. The same model may come twice, but two
-    models of one category never do. A scene's objects are sampled with replacement from ``SHELF`` models of different
-    categories. LIBERO-Plus repeats its 13 models as often: in 6, 21, 42 and 60 % of its scenes with 2, 3, 4 and 5.
+    The level is the number of objects, 1 to 5 as in LIBERO-Plus. No object has a category that is in the scene already,
+    that the instruction names, or that the test set adds. A scene may repeat a model, but never has two models of one
+    category. A scene's objects are sampled with replacement from ``SHELF`` models of different categories. LIBERO-Plus
+    repeats its 13 models as often: in 6, 21, 42 and 60 % of its scenes with 2, 3, 4 and 5 objects.
 
     Attributes:
-        sources: ``libero`` and ``robosuite`` are installed; ``sweethome3d`` (fetched by apt-get, 120 MB) and folders of
-            the user's are converted when a plan first draws from them.
-        area_m2: the most that the objects take up together, each of them at most its share: the more objects, the
-            smaller (0.12 m2 is what the broadest object of all takes up).
+        levels: Numbers of added objects to sample, 1 to 5, each entry with equal probability; all five by default.
+        sources: Sources of the objects; by default ``libero`` and ``robosuite``, which setup installs. ``sweethome3d``
+            (fetched by apt-get, 120 MB) and the user's folders are converted when a plan first uses them.
+        area_m2: Largest area of all added objects together, in m2; 0.12 by default, the area of the broadest object.
+            Each object has at most an equal share of it.
     """
 
     draws: ClassVar = (LayoutPerturbation,)

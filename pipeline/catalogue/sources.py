@@ -9,9 +9,9 @@ class Folder(BaseModel, frozen=True, extra="forbid"):
     """Folder of textures or objects that the user has a right to use.
 
     Attributes:
-        folder: for textures, searched with its subfolders for PNG and JPEG files; for objects, it holds
+        folder: Path of the folder. Textures are the PNG and JPEG files in it and its subfolders. Objects are
             ``<category>/<name>.obj`` (y up, in metres) and ``<category>/<name>.xml`` (MJCF, z up).
-        licence: what they may be used under, recorded with every episode that shows one.
+        licence: Licence of the textures or objects, recorded with every episode that shows one of them.
     """
 
     folder: Place

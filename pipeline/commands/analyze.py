@@ -72,8 +72,8 @@ def coverage(config: Path) -> None:
     from pipeline.testset import benchmark
 
     measures = seen.measure(open_run(config), benchmark.load())
-    table = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
-    table.caption = "A run adds each number of objects equally often, unless it is configured otherwise."
+    table = Table("axis", "visible effect: median (tenth to ninetieth percentile)", "test tasks", "this run")
+    table.caption = "By default, a run adds each number of objects equally often."
     figures: dict[str, Any] = {}
     for measure in measures:
         cells = ["-" if spread is None else str(spread) for spread in (measure.tested, measure.ours)]
@@ -145,7 +145,9 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
         seeds.update(row.seed for row, _ in results_of_model)
     seed, *further_seeds = sorted(seeds)
     if further_seeds:
-        raise PipelineError(f"results of seeds {sorted(seeds)}", expected="one seed, and so the same draws")
+        raise PipelineError(
+            f"the results have the seeds {sorted(seeds)}", expected="one seed, and therefore the same perturbations"
+        )
     graded = statistics.grade(results)
     write_tasks(graded, seed, out)
     difficulties = [task["difficulty"] for task in graded]
@@ -173,8 +175,9 @@ def leakage(results: Path, config: Path) -> int:
         for perturbation in from_json(json.dumps(row.perturbations)):
             perturbations.append((row.name, perturbation, find_task(row.suite, row.base)))
     if not perturbations:
-        lacking = "there are no held-out perturbations"
-        raise PipelineError(lacking, where=results, remedy="evaluate --source own")
+        raise PipelineError(
+            "the results have no held-out perturbations", where=results, remedy="run `evaluate --source own`"
+        )
     findings = own_draws.compare(perturbations, own_draws.planned(open_run(config).plan_file))
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

@@ -36,13 +36,14 @@ def axes() -> None:
 
     from pipeline.axes import AXES, components_of
 
-    table = Table("axis", "components", "made again", "changes", box=None)
+    table = Table("axis", "components", "generated again", "changes", box=None, pad_edge=False)
     for axis in AXES:
         kind = AXES[axis].draws[0]
         views = " and ".join(sorted(kind.views)) or "instruction"
         table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
     Console(highlight=False).print(table)
-    print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` shows what an axis does.")
+    print("Ranges and levels: see docs/configuration.md and docs/axes.md.")
+    print("Pictures of an axis: see `python -m pipeline preview --help`.")
 
 
 @click.command(cls=Command)

@@ -171,9 +171,9 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path
         assert done.returncode == 0, done.stderr
         lines = [line.strip() for line in done.stdout.splitlines()]
         assert any(line.startswith("disk: ") and "GB free" in line for line in lines)
-        if "nothing would run: all of this configuration is made" in lines:
+        if "no stage would run: all datasets are finished" in lines:
             return []
-        told = [line.partition(":")[0] for line in lines[lines.index("would run:") + 1 :] if ": " in line]
+        told = [line.partition(":")[0] for line in lines[lines.index("stages that would run:") + 1 :] if ": " in line]
         assert told[-1] == "time left" or told[-2:] == ["plan", "disk"], "there is no estimate without a plan"
         return [line for line in told if line not in ("disk", "time left")]
 
@@ -191,33 +191,35 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path
     (clone / "card").rename(clone / "data/tiny/card")
     (clone / "data/tiny/leakage.json").write_text("{}")
     assert would_run() == ["leakage", "card", "report"]
-    assert "leakage: leakage.json is missing or has changed" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "leakage: leakage.json has changed" in call(clone, "status", "configs/tiny.yaml").stdout
     shutil.copy(finished / "leakage.json", clone / "data/tiny/leakage.json")
     demos = tiny_config(shutil.copytree(short_demos, clone / short_demos.name))["demos"]
     configured(clone, demos=demos)
     assert would_run() == [], "the place of the demonstrations changes nothing"
     (clone / short_demos.name / "another").write_text("")
-    assert would_run() == ["plan", "exports and all that follows"]
-    assert "plan: other demos.root/another" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert would_run() == ["plan", "exports and later stages"]
+    assert "plan: changed demos.root/another" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / short_demos.name / "another").unlink()
     configured(clone, export={"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 2}})
-    assert would_run() == ["doctor", "export_rlds", "manifest and all that follows"]
+    assert would_run() == ["doctor", "export_rlds", "manifest and later stages"]
     configured(clone, export=tiny_config(clone)["export"])
     rendered, *others = sorted((clone / "data/tiny/frames").glob("*/"))
     shutil.rmtree(rendered)
-    assert would_run() == ["render", "exports and all that follows"]
+    assert would_run() == ["render", "exports and later stages"]
     (clone / "data/tiny/trajectories" / f"{others[0].name}.npz").unlink()
-    assert would_run() == ["replay", "render", "exports and all that follows"]
+    assert would_run() == ["replay", "render", "exports and later stages"]
     configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
-    assert "plan: other plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "plan: changed plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / "data/tiny/plan.parquet").unlink()
     told = call(clone, "status", "configs/tiny.yaml").stdout
     assert "  plan: " in told
-    assert re.search(r"no longer needed, and deleted by a run with REMAKE=1, without which it stops: \d+ traj", told)
+    assert re.search(
+        r"no longer needed: \d+ traj.*A run stops before it deletes this work, unless REMAKE=1 allows it", told
+    )
     for folder in ("trajectories", "frames"):
         shutil.rmtree(clone / "data/tiny" / folder)
     told = call(clone, "status", "configs/tiny.yaml").stdout
-    assert re.search(r"no longer needed, .*: \d+ episodes of the datasets", told), "they would be replaced"
+    assert re.search(r"no longer needed: \d+ episodes of the datasets", told), "they would be replaced"
     for record in ("rlds.json", "lerobot.json"):
         (clone / "data/tiny" / record).unlink()
     assert would_run() == ["plan"]
@@ -314,7 +316,7 @@ def test_run_elsewhere_with_a_subset_in_one_format(ablation: Ablation) -> None:
     recipe = yaml.safe_load((data / "finetune/finetune.yaml").read_text())
     assert tuple(recipe["clients"]) == Rlds.clients
     assert [entry.name for entry in (data / "card").iterdir() if entry.is_dir()] == ["rlds"]
-    assert "nothing would run" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "no stage would run" in call(clone, "status", "configs/tiny.yaml").stdout
 
     found = call(clone, "dataset", "check", "configs/tiny.yaml")
     assert found.returncode == 0, found.stdout + found.stderr

@@ -148,7 +148,7 @@ def rotten(data: Path) -> None:
     ("spoil", "complaint"),
     [
         (rotten, r"\.mp4: was changed since it was written"),
-        (unvalidated, r"validation\.json: not there"),
+        (unvalidated, r"validation\.json: the file is missing"),
         (failed, r"1 of 1 checks failed: gripper \(episode-1 is turned\)"),
         (vacuous, "at least one check"),
         (exported_since, r"validation\.json: older than .*info\.json"),
@@ -158,7 +158,7 @@ def rotten(data: Path) -> None:
         (hidden, r"not of the dataset.*\.cache/note"),
         (elsewhere, r"1 that lie elsewhere, such as tiny/meta/stats\.json"),
         (folder_elsewhere, "such as tiny/more"),
-        (key_in_card, r"card: 1 files are not as they were generated: lerobot/\.env \(added\)"),
+        (key_in_card, r"card: 1 files differ from the generated ones: lerobot/\.env \(added\)"),
         (key_in_finetune, r"finetune: .*: wandb_key\.json \(added\)"),
         (repository_in_card, r"lerobot/\.git/config \(added\)"),
         (link_in_card, r"lerobot/pictures/key\.png \(a link\)"),
