@@ -1,17 +1,19 @@
 """The configuration: what is not understood is refused, by file, field and remedy."""
 
+import inspect
 import json
 import math
 import re
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jsonschema
 import pytest
 import yaml
 from conftest import REPOSITORY
+from pydantic import BaseModel
 
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.language import LanguageAxis
@@ -49,6 +51,27 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
     assert stored == schemas()[name], "run: python -m pipeline schema"
 
 
+def models_in(annotation: Any) -> set[type[BaseModel]]:
+    """Find the models that a type annotation contains, and the models in their fields."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        found = {annotation}
+        for field in annotation.model_fields.values():
+            found |= models_in(field.annotation)
+        return found
+    return set().union(*(models_in(part) for part in get_args(annotation)))
+
+
+@pytest.mark.parametrize("model", sorted(models_in(Config), key=lambda model: model.__name__))
+def test_every_field_is_described(model: type[BaseModel]) -> None:
+    """The descriptions are a table of the documentation: one entry for each field, in whole sentences."""
+    entries = inspect.getdoc(model).partition("Attributes:\n")[2]  # type: ignore[union-attr]
+    described = dict(re.findall(r"^    (\w+): (.*(?:\n     .*)*)", entries, re.MULTILINE))
+    assert list(described) == [name for name in model.model_fields if name in described], "in the order of the fields"
+    assert set(described) == set(model.model_fields)
+    for name, text in described.items():
+        assert re.fullmatch(r"(?s)([A-Z0-9]|``).*\.", text), name
+
+
 @pytest.mark.parametrize(
     ("value", "keys", "message"),
     [
@@ -80,7 +103,7 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
         ({"robot": {"norm_rad": [0.1, 0.2, 0.3, 0.4, math.inf]}}, ("plan", "axes"), "finite number"),
         (2**63, ("plan", "seed"), "plan.seed: expected less than"),
         ({"camera": 10**9}, ("plan", "episodes"), "plan.episodes.camera: expected at most 1000000, got 1000000000"),
-        ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: there is no such field; the fields are layout, pose"),
+        ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: unknown field; the fields are layout, pose"),
         ({"source": "starter", "root": "/tmp"}, ("demos",), "source: hdf5 and root require each other"),
         ({"source": "hdf5"}, ("demos",), "source: hdf5 and root require each other"),
         ({"tasks": ["libero_goal/put_the_bowl_on_the_plat"]}, ("demos",), "libero_goal/put_the_bowl_on_the_plate"),

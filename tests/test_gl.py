@@ -216,7 +216,7 @@ def test_a_gpu_that_no_vendor_file_names(machine: Path, monkeypatch: pytest.Monk
     # What it says to write is such a file.
     (machine / "vendors" / "10_nvidia.json").write_text(remedy.split("'")[1])
     monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
-    assert (gl.idle_gpu() or ("", ""))[0] == "its driver does not answer"
+    assert (gl.idle_gpu() or ("", ""))[0] == "the GPU's driver does not answer"
 
 
 @pytest.mark.parametrize("nvidia", [False, True])

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from pipeline.commands.base import Command
+from pipeline.commands.base import Command, example
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 
@@ -21,9 +21,9 @@ def schemas() -> dict[str, dict[str, Any]]:
     return {"config.schema.json": config, "manifest.json": manifest.described(registry.columns())}
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("schema"))
 def schema() -> None:
-    """Write the files of schemas/ that follow from the code."""
+    """Write the files of schemas/ that follow from the code: config.schema.json and manifest.json."""
     from pipeline.files import write
 
     for name, content in schemas().items():

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -59,6 +60,24 @@ def test_every_command_is_listed_and_explains_itself(
             assert re.search(r"\n\n  [A-Z]\w+ .*", page), "the first sentence"
         else:
             assert re.search(rf"^  {command[-1]} +[A-Z]", page, re.MULTILINE), "its line in the list"
+
+
+@pytest.mark.parametrize("command", commands(), ids=" ".join)
+def test_every_help_page_has_an_example_that_the_command_takes(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "argv", ["pipeline", *command, "--help"])
+    assert main() == 0
+    page = capsys.readouterr().out
+    assert max(map(len, page.splitlines())) <= 80
+    examples = page.partition("  Example")[2].replace("\\\n", " ").splitlines()[1:]
+    assert examples
+    for line in examples:
+        program, words = line.split(None, 3)[:3], shlex.split(line)[3:]
+        assert program == ["python", "-m", "pipeline"]
+        assert tuple(words[: len(command)]) == command
+        parse(words)
 
 
 def test_a_moved_command_names_its_new_place(
@@ -232,7 +251,7 @@ def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
     asked = call(clone, "clean", "configs/tiny.yaml", stdin=subprocess.DEVNULL)
     assert asked.returncode == 1
     assert "add --yes" in asked.stderr
-    assert "made again by export_rlds" in asked.stdout
+    assert "generated again by export_rlds" in asked.stdout
     assert set(data.rglob("*")) == files
     done = call(clone, "clean", "--only", "rlds", "--yes", "configs/tiny.yaml")
     assert done.returncode == 0, done.stderr
@@ -241,7 +260,7 @@ def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
     assert call(clone, "clean", "--yes", "configs/tiny.yaml").returncode == 0
     left = {file.name for file in data.iterdir()}
     assert left == {"notes.txt", "configuration.json", "machine.json", ".lock"}
-    assert "has nothing of this" in call(clone, "clean", "configs/tiny.yaml").stdout
+    assert "has no files of these parts" in call(clone, "clean", "configs/tiny.yaml").stdout
 
 
 @dataclass

@@ -166,7 +166,7 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     # As a worker finds out that joins when the work is under way.
     with (
         Client(address) as client,
-        pytest.raises(PipelineError, match=r"does not see .* has Python 3\.\d+\.\d+, the run has 2"),
+        pytest.raises(PipelineError, match=r"does not see .* has Python 3\.\d+\.\d+, but the run has 2"),
     ):
         client.submit(Workplace(Path.cwd(), folder / "token", {"Python": "2"}).enter).result()
 

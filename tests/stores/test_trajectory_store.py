@@ -216,7 +216,7 @@ def test_a_changed_number_is_not_read(trajectories: Path, name: str) -> None:
 
     file = next(trajectories.glob("*.npz"))
     _rewrite(file, change_last_number)
-    with pytest.raises(PipelineError, match=rf"damaged .*{name}(?s:.*)move the file away"):
+    with pytest.raises(PipelineError, match=rf"damaged .*{name}(?s:.*)move the file to another place"):
         TrajectoryStore(trajectories).load(file.stem)
 
 

@@ -77,6 +77,26 @@ def test_disk_is_asked_for_as_the_configuration_needs_it(
     assert "fail  disk" in capsys.readouterr().err
 
 
+def test_no_word_of_the_results_is_broken_at_80_columns(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Paths and commands can be copied, whatever their length."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    link_testset(tmp_path)
+    long = "/a/path/that/is/longer/than/the/column/of/the/results/of/all/checks/and/still/in/one/piece"
+    broken = doctor.Diagnosis("demos", "fail", f"no demonstration is in {long}", f"hf download --local-dir {long} [me]")
+    listed = [*found(tmp_path / "data").values(), broken]
+    monkeypatch.setattr(doctor, "check", lambda run, need_gb: listed)
+    assert run_doctor("starter", monkeypatch, free_gb=1) == 1
+    lines = capsys.readouterr().err.splitlines()
+    words = {word for line in lines for word in line.split()}
+    for finding in listed:
+        assert {*finding.name.split(), *finding.detail.split(), *finding.remedy.split()} <= words
+    assert all(len(line) <= 80 for line in lines if long not in line)
+    assert "try: hf download --local-dir" in " ".join(" ".join(lines).split())
+
+
 @pytest.mark.parametrize(("name", "gb"), [("full", 440), ("paper", 350), ("joint", 94), ("small", 30)])
 def test_the_room_that_configurations_name_is_what_doctor_asks_for(name: str, gb: int) -> None:
     file = REPOSITORY / "configs" / f"{name}.yaml"
