@@ -1,4 +1,4 @@
-"""Files that are either whole or missing."""
+"""Files that are either complete or missing."""
 
 import json
 import os
@@ -80,12 +80,12 @@ def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
 
 
 def write_json(file: Path, content: object) -> None:
-    """Write a file that ``read_json`` reads; it is whole or missing."""
+    """Write a file that ``read_json`` reads; it is complete or missing."""
     write(file, json.dumps(content, indent=1) + "\n")
 
 
 def write(file: Path, content: str | bytes) -> None:
-    """Write a file, text as UTF-8; it is whole or missing."""
+    """Write a file, text as UTF-8; it is complete or missing."""
     with replaced(file) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -195,7 +195,7 @@ def is_temporary(name: str, of: str | None = None) -> bool:
 def remove_leftovers(folder: Path) -> None:
     """Delete temporaries that killed processes left in a folder during ``replaced``.
 
-    The caller must hold a lock that keeps all other processes, on every host, from writing to the folder. The name of a
+    The caller must have a lock that keeps all other processes, on every host, from writing to the folder. The name of a
     temporary does not show if its process still lives on another host.
     """
     for entry in folder.glob(".*.tmp"):  # Nothing if the folder does not exist.

@@ -210,7 +210,7 @@ class _NoDeviceError(Exception):
 def _best_device(backend: str) -> tuple[str, str | None]:
     """Return the first GPU, or else the first renderer: its name and the ``MUJOCO_EGL_DEVICE_ID`` that it needs."""
     index = os.environ.get("MUJOCO_EGL_DEVICE_ID")
-    # Render on the GPU that the job was given, if EGL and CUDA count alike: robosuite follows the same rule, and
+    # Render on the GPU of the job, if EGL and CUDA use the same numbers: robosuite follows the same rule, and
     # rejects a device that is not in this list. Without an index MuJoCo uses the first device that answers.
     first_visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0]
     if backend == "egl" and index is None and first_visible.isdigit():

@@ -54,7 +54,7 @@ class Record:
         return self.basis.identity == basis.identity
 
     def same_request(self, basis: Basis) -> bool:
-        """Return whether the user asks for the same, so that only the installation or the machine can differ."""
+        """Return whether the requests are equal, so that only the installation or the machine can differ."""
         return bool(self.basis.requested == basis.requested)
 
     def why_not(self, basis: Basis, unnamed: Collection[str] = ()) -> str | None:

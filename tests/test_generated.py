@@ -86,7 +86,7 @@ def test_an_edit_is_named_and_stays_until_it_is_allowed(
     before = states(folder)
     with pytest.raises(PipelineError) as caught:
         generate(folder, one="another", two="another")
-    for words in (EDITS[edit], "publish:", "a copy", "REMAKE=1"):
+    for words in (EDITS[edit], "publish:", "copy the files", "REMAKE=1"):
         assert words in str(caught.value)
     assert states(folder) == before
     assert [line.count(EDITS[edit]) for line in edits_in_words(folder.parent)] == [1]

@@ -188,7 +188,7 @@ def test_a_gpu_without_its_node(machine: Path) -> None:
     (machine / "nvidia0").unlink()
     (machine / "gpus").mkdir()
     what, remedy = gl.idle_gpu() or ("", "")
-    assert what.endswith(f"there is no {machine}/nvidia0")
+    assert what.endswith(f"{machine}/nvidia0 is missing")
     assert "nvidia-modprobe" in remedy
     assert "--nv" in remedy
 

@@ -248,7 +248,7 @@ class _Workers:
             except Empty:
                 self.refill()
                 workers, came_s = self._there()
-                # A new worker may be starting, or may have come and died over its work.
+                # A new worker may be starting, or may have connected and died over its work.
                 alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
                 last_came_s = came_s
                 if alone_s >= self.patience_s:
@@ -256,7 +256,7 @@ class _Workers:
                     raise self._lost(what) from None
 
     def _there(self) -> tuple[int, float]:
-        """Return the number of workers, and the time when the last one came, by the scheduler's clock."""
+        """Return the number of workers, and the time when the last worker connected, by the scheduler's clock."""
         try:
             events = self.client.get_events("all")
             came_s = [stamp for stamp, event in events if event.get("action") == "add-worker"]

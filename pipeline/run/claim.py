@@ -26,7 +26,7 @@ PARAMS = Path("params.yaml")
 """File that states the run of `dvc repro` and its folder."""
 
 LOCK = ".lock"
-"""Empty file of a run's folder that a stage holds while it runs."""
+"""Empty file of a run's folder that a stage locks while it runs."""
 
 
 class Mark(NamedTuple):
@@ -94,7 +94,7 @@ def locked(folder: Path) -> Iterator[None]:
             raise PipelineError(
                 f"the file system cannot lock a file ({error.strerror})",
                 where=folder,
-                expected="a file system whose locks hold on all machines that see the folder",
+                expected="a file system whose locks are valid on all machines that see the folder",
                 remedy="mount it with locks (Lustre: -o flock), or set `folder:` to a folder on another file system",
             ) from error
         remove_leftovers(folder)

@@ -105,7 +105,7 @@ def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
 
 
 def refuse_deletion(rows: Sequence[plan.Row], run: Run) -> None:
-    """Print how much finished work a plan drops, and stop if it is much and nobody allowed the deletion.
+    """Print the amount of finished work that a plan drops, and stop if it is large and the deletion is not allowed.
 
     Raises:
         PipelineError: when the share is above ``LARGEST_SHARE`` and ``REMAKE=1`` is not set. Nothing was changed.

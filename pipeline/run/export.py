@@ -189,7 +189,7 @@ def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
 
 
 def is_current(target: AnyFormat, episodes: Episodes) -> bool:
-    """Return whether the dataset exists, is whole and has these episodes.
+    """Return whether the dataset exists, is complete and has these episodes.
 
     Every file must exist and be no younger than the record. If so, statistics that a client stored in the sets are
     removed.
@@ -265,8 +265,8 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         workers: get one call for each piece.
 
     Raises:
-        PipelineError: when an episode breaks the schema or the ids are unfit. The earlier dataset stays; whole pieces
-            stay in the work folder.
+        PipelineError: when an episode breaks the schema or the ids are unfit. The earlier dataset stays, and finished
+            pieces stay in the work folder.
     """
     pieces, basis = target.pieces(episodes), compute_basis(target, episodes)
     work = target.work / basis.identity

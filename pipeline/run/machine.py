@@ -93,7 +93,7 @@ def trial() -> Trial:
 def _seconds(call: Callable[[], object], gpu: bool = False) -> float:
     """Return the time of the quickest of ten calls, in s.
 
-    It is processor time, so that other work counts little; for a GPU it is wall-clock time.
+    For a processor it is processor time, on which other work has little effect. For a GPU it is wall-clock time.
     """
     timer = time.perf_counter if gpu else time.process_time
     return min(timeit.repeat(call, number=1, repeat=10, timer=timer))

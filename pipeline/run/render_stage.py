@@ -55,7 +55,7 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
 def render_plan(
     rows: Sequence[Row], config: Config, trajectories: TrajectoryStore, frames: FrameStore, workers: Workers
 ) -> set[str]:
-    """Render the streams that ``frames`` lacks of every kept episode, and of failures if the configuration asks.
+    """Render the missing streams of every kept episode, and of failures if the configuration requests them.
 
     Reserves replace episodes with rejected frames. Rendering therefore repeats until it has generated all files that it
     can from the stored trajectories.

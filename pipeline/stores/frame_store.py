@@ -190,7 +190,7 @@ class FrameStore(Store):
 
 
 def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
-    """Return the name of the file that holds these streams of a trajectory, or states that they were rejected."""
+    """Return the name of the file with these streams of a trajectory, or with the reasons of their rejection."""
     return f"{trajectory_id}/{digest(*sorted(streams))[:16]}"
 
 
@@ -224,7 +224,7 @@ def merged(parts: Sequence[Rendered]) -> Rendered:
 
 
 def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[str]) -> Rendered:
-    """Read the named streams and geometry of a file, and all other values that it holds."""
+    """Read the named streams and geometry of a file, and all its other values."""
     quality = file.attributes["quality"]
     return Rendered(
         replay_mode=file.attributes["replay_mode"],
