@@ -1,4 +1,4 @@
-# Short names for setup.sh, which works where make is not installed.
+# Short names for setup.sh, which also works without make.
 
 .PHONY: setup run quick test doctor site lock sbom
 
@@ -21,13 +21,13 @@ doctor: setup
 site: setup
 	.venv/bin/python -m mkdocs build --strict
 
-# pynput and evdev are left out: only lerobot's keyboard teleoperation needs them, and evdev takes a compiler.
+# pynput and evdev are left out: only lerobot's keyboard teleoperation needs them, and evdev requires a compiler.
 lock: setup
 	UV_CUSTOM_COMPILE_COMMAND="make lock" .venv/bin/uv pip compile --quiet --universal --python-version 3.11 \
 		pyproject.toml --group dev --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
 		--no-emit-package pynput --no-emit-package evdev -o requirements.lock
 
-# Every installed package with version and licence, without the links of each. The tool runs in an environment of its own.
+# Every installed package with version and licence, without its links. The tool runs in a separate environment.
 sbom: setup
 	.venv/bin/uv tool run --from cyclonedx-bom==7.5.0 cyclonedx-py environment --output-reproducible --of JSON \
 		--pyproject pyproject.toml -o sbom.json .venv

@@ -1,4 +1,4 @@
-"""The one build step that cannot be written in pyproject.toml: ``schemas/`` is installed inside of the library."""
+"""Build step that pyproject.toml cannot express: install ``schemas/`` inside the library."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ SCHEMAS = [str(file) for file in sorted(Path("schemas").iterdir())]
 
 
 class BuildWithSchemas(build_py):
-    """Copies the schemas to where ``pipeline.files.schema_file`` looks first."""
+    """Build step that copies the schemas to the first place that ``pipeline.files.schema_file`` searches."""
 
     def run(self) -> None:
         super().run()
@@ -20,7 +20,7 @@ class BuildWithSchemas(build_py):
                 self.copy_file(file, str(folder))
 
     def get_source_files(self) -> list[str]:
-        """List the files that a source distribution has to hold."""
+        """List the files that a source distribution must contain."""
         return [*super().get_source_files(), *SCHEMAS]
 
 

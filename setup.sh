@@ -1,29 +1,30 @@
 #!/usr/bin/env bash
-# Installs what the pipeline needs on Debian 12, 13 or Ubuntu 24.04, and is quick when it is there:
+# Installs all packages of the pipeline on Debian 12, Debian 13 or Ubuntu 24.04. A repeated call takes seconds.
 #   bash setup.sh [run|quick|test]
-#   run    then makes the datasets of the configuration configs/starter.yaml
-#   quick  then checks style and types and runs the tests that take little time
-#   test   then checks style and types and runs all tests, one of them in a browser
+#   run    then generates the datasets of the configuration configs/starter.yaml
+#   quick  then checks style and types, and runs the short tests
+#   test   then checks style and types, and runs all tests, one of them in a browser
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
 UV_VERSION=0.13.8
-# Those of the lock, in the order in which they are looked for.
+# Versions of Python that the lock supports, in the order of the search.
 PYTHONS=(3.11 3.12 3.13)
 VERB=${1:-}
 
 fail() { printf 'setup.sh: %s\n' "$@" >&2; exit 1; }
 
-# After a tool's own words: the disk, which it frees again when it fails, and what else most often stops it.
+# Ends after the message of a failed tool. A full disk is named first: a tool frees its files again when it fails.
 stopped() {
     local folder free_mb cache=${UV_CACHE_DIR:-$HOME/.cache/uv}
     for folder in . "${TMPDIR:-/tmp}" "${UV_CACHE_DIR:-$HOME}"; do
         free_mb=$(df --output=avail --block-size=1M "$folder" 2>/dev/null | tail -n 1) || continue
         ((free_mb > 2000)) ||
-            fail "$1; only $((free_mb)) MB are free at $folder" "  try: free 10 GB there, then run this again"
+            fail "$1; only $((free_mb)) MB are free at $folder" "  try: free 10 GB there, then run setup.sh again"
     done
-    fail "$1; its reason stands above" \
-        "  try: mend the network, or the mirror in pip's configuration; or remove a broken cache, rm -rf $cache"
+    fail "$1; see the reason above" \
+        "  try: check the network and the mirror in pip's configuration; if the cache $cache is broken," \
+        "       set UV_CACHE_DIR to an empty folder"
 }
 
 version_of() { "$1" -c 'import sys; print(*sys.version_info[:2], sep=".")' 2>/dev/null || true; }
@@ -31,14 +32,14 @@ version_of() { "$1" -c 'import sys; print(*sys.version_info[:2], sep=".")' 2>/de
 find_python() {
     local wanted candidate conda=${CONDA_EXE:-}
     for wanted in "${PYTHONS[@]}"; do
-        # What is installed stays. What is half installed does not, as uv takes it for whole.
+        # Keep a finished installation. Replace an unfinished one, because uv would take it for finished.
         if [[ -e .venv/installed && -x .venv/bin/pip && $(version_of .venv/bin/python) == "$wanted" ]]; then
             echo .venv/bin/python
             return
         fi
     done
     for wanted in "${PYTHONS[@]}"; do
-        # A pyenv shim is on PATH even for versions that are not there, so ask it instead of looking for it.
+        # PATH has pyenv's shims also for missing versions, so start each candidate and ask for its version.
         for candidate in "python$wanted" python3 python "${PYENV_ROOT:-$HOME/.pyenv}/versions/$wanted".*/bin/python \
             "${conda%/bin/conda}"/{,envs/*/}bin/python; do
             if [[ $(version_of "$candidate") == "$wanted" ]]; then
@@ -51,7 +52,7 @@ find_python() {
         "  try: sudo apt-get install -y python3 python3-venv"
 }
 
-# By uv, which any Python 3 installs.
+# Fetches Python with uv, which any Python 3 installs.
 fetch_python() {
     local uv
     if ! uv=$(command -v uv); then
@@ -62,7 +63,7 @@ fetch_python() {
     "$uv" python install "${PYTHONS[0]}" >&2 && "$uv" python find --managed-python "${PYTHONS[0]}"
 }
 
-# Looks for the libraries themselves: whoever installed them, and with or without dpkg.
+# Searches for the libraries themselves, because they may be installed without dpkg.
 missing_packages() {
     local libraries
     libraries=$(PATH=$PATH:/usr/sbin:/sbin ldconfig -p)
@@ -73,11 +74,11 @@ missing_packages() {
     has '\blibOSMesa\.so' || echo libosmesa6
     has '\blibgthread-2\.0\.so\.0' || echo libglib2.0-0   # OpenCV
     has '\blibMagickWand-.*\.so' || echo imagemagick   # the tests' reference for the benchmark's noise
-    has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which links libpython too; later lerobots do without
+    has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which also links libpython; later versions of lerobot do not
     [[ $VERSION != 3.11 ]] || "$PYTHON" -c 'import ctypes; ctypes.CDLL("libpython3.11.so.1.0")' 2>/dev/null ||
         echo libpython3.11
     command -v git >/dev/null || echo git
-    # The tests' browser and batch system; `quick` leaves out the tests that need them.
+    # Browser and batch system of the tests; `quick` skips the tests that need them.
     [[ $VERB != test ]] || command -v chromium-headless-shell >/dev/null || echo chromium-headless-shell
     [[ $VERB != test || -x /usr/sbin/slurmctld ]] || echo slurm-wlm
     "$PYTHON" -c 'import ensurepip' 2>/dev/null || echo "python$VERSION-venv"
@@ -87,7 +88,7 @@ install_packages() {
     local as_root=() install=(apt-get install -y --no-install-recommends "$@")
     if [[ $(id -u) != 0 ]]; then as_root=(sudo -n); fi
     if ! command -v apt-get >/dev/null || ! "${as_root[@]}" true 2>/dev/null; then
-        fail "these Debian packages are missing, and installing them takes root: $*" "  try: sudo ${install[*]}"
+        fail "these Debian packages are missing, and their installation requires root: $*" "  try: sudo ${install[*]}"
     fi
     # One broken third-party source must not stop the others.
     "${as_root[@]}" apt-get update -qq || true
@@ -99,25 +100,25 @@ install_venv() {
     local index
     if [[ $PYTHON != .venv/bin/python ]]; then
         rm -rf .venv
-        "$PYTHON" -m venv .venv || stopped "$PYTHON could not make .venv"
+        "$PYTHON" -m venv .venv || stopped "$PYTHON could not create .venv"
     fi
     .venv/bin/pip install --quiet "uv==$UV_VERSION" || stopped "pip could not install uv"
-    # uv does not read pip's configuration: hand on the mirror that is named there.
+    # uv does not read pip's configuration: pass it the mirror of this configuration.
     index=${PIP_INDEX_URL:-$(.venv/bin/pip config get global.index-url 2>/dev/null || true)}
     if [[ -n $index ]]; then export UV_DEFAULT_INDEX=${UV_DEFAULT_INDEX:-$index}; fi
     export VIRTUAL_ENV=$PWD/.venv
-    # Compiled once: where PYTHONDONTWRITEBYTECODE is set, each process would compile torch and the others again.
+    # Compile once. Otherwise, if PYTHONDONTWRITEBYTECODE is set, each process would compile torch and others again.
     .venv/bin/uv pip sync --compile-bytecode --require-hashes requirements.lock ||
         stopped "uv could not install requirements.lock"
     # The lock holds the build back end, so the package itself needs no network.
     .venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable . ||
         stopped "uv could not install this package"
-    # So that not every worker of the first run compiles them. Where nothing renders, `doctor` says so later.
+    # Compile Numba's loops once, instead of in every worker of the first run. `doctor` later reports missing renderers.
     .venv/bin/python -m pipeline.validation.loops || true
 }
 
 [[ $VERB =~ ^(run|quick|test|)$ ]] || fail "unknown verb '$VERB', expected run, quick, test or none"
-# The lock has packages for nothing else.
+# The lock only has packages for this platform.
 [[ $(uname -sm) == "Linux x86_64" ]] || fail "this machine is $(uname -sm), not Linux x86_64"
 PYTHON=$(find_python)
 VERSION=$(version_of "$PYTHON")
@@ -134,7 +135,7 @@ if [[ ! -x .venv/bin/python || $(cat .venv/installed 2>/dev/null) != "$stamp" ]]
     echo "$stamp" >.venv/installed
 fi
 
-# DVC's stages call `python`.
+# The stages of DVC call `python`.
 export PATH=$PWD/.venv/bin:$PATH
 case $VERB in
 run)
@@ -143,12 +144,12 @@ run)
 quick | test)
     ruff check
     ruff format --check
-    # Beside the tests, whose two processes are not always busy.
+    # Check types next to the tests, whose two processes are not always busy.
     mypy &
     types=$!
-    # Two processes, a module at a time; the longest first, as tests/conftest.py orders them.
+    # Two processes take one module at a time. tests/conftest.py puts the longest modules first.
     together=(-n 2 --dist loadfile --no-loadscope-reorder)
-    # Each on one core, as a run's workers are.
+    # Each process uses one core, as the workers of a run do.
     export LP_NUM_THREADS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
     if [[ $VERB == quick ]]; then pytest "${together[@]}" -m "not slow"; else pytest "${together[@]}"; fi
     wait "$types"

@@ -8,20 +8,23 @@ from pipeline.axes.base import Frozen
 from pipeline.types import Count
 
 LARGEST_GB = 4.6
-"""Most memory that a worker process has taken: in ``validate`` of 1,004 episodes of all 40 tasks (docs/cost.md)."""
+"""Largest measured memory of a worker process, in ``validate`` of 1,004 episodes of all 40 tasks (docs/cost.md)."""
 
 JOB_GB = round(4 / 3 * LARGEST_GB)
-"""Memory of a job of SLURM, which ends a job that takes more: a third above ``LARGEST_GB``."""
+"""Memory of a SLURM job, a third above ``LARGEST_GB``. SLURM ends a job that takes more."""
 
 
 class SlurmConfig(Frozen):
-    """Resources of each worker's SLURM job; fields that are left out have the value of the site's ``jobqueue.yaml``.
+    """Resources of each worker's SLURM job. Omitted fields have the values of the site's ``jobqueue.yaml``.
 
     Attributes:
-        partition, account: of the site.
-        walltime: after which SLURM ends a worker, such as ``"12:00:00"``; another worker repeats its work.
-        memory_gb: of a worker; ``JOB_GB`` where neither this nor the site's ``job-mem`` is set.
-        options: further options of ``sbatch``, such as ``--gres=gpu:1``, after the site's ``job-extra-directives``.
+        partition: Partition of the site; by default the site's own setting.
+        account: Account of the site; by default the site's own setting.
+        walltime: Time after which SLURM ends a worker, such as ``"12:00:00"``; by default the site's own setting.
+            Another worker then repeats the unfinished work.
+        memory_gb: Memory of a worker in GB; by default the site's ``job-mem``, or 6 GB without it.
+        options: Further options of ``sbatch``, such as ``--gres=gpu:1``, added to the site's ``job-extra-directives``;
+            none by default.
     """
 
     partition: str | None = None
@@ -32,13 +35,13 @@ class SlurmConfig(Frozen):
 
 
 class ComputeConfig(Frozen):
-    """Place of the computation; it never changes the result.
+    """Place of the computation, which never changes the result.
 
     Attributes:
-        cluster: ``local`` starts worker processes here, ``loop`` runs everything in this process, ``slurm`` has SLURM
-            start them, anything with ``://`` is the address of a Dask scheduler.
-        workers: processes of a local cluster, one for each core when left out; or jobs of SLURM.
-        slurm: what a job asks for.
+        cluster: ``local`` starts worker processes on this machine, and ``loop`` computes in a single process.
+            ``slurm`` starts each worker as a SLURM job. An address with ``://`` is a running Dask scheduler.
+        workers: Number of worker processes; by default one for each core. ``slurm`` requires it, as the number of jobs.
+        slurm: Resources of each SLURM job, only with ``cluster: slurm``; by default the site's own settings.
     """
 
     cluster: str = Field(default="local", pattern=r"^(local|loop|slurm|\w+://.+)$")
@@ -50,5 +53,5 @@ class ComputeConfig(Frozen):
         if self.cluster == "slurm" and self.workers is None:
             raise ValueError("cluster: slurm needs a number of workers")
         if self.cluster != "slurm" and self.slurm is not None:
-            raise ValueError("slurm goes with cluster: slurm, and only with it")
+            raise ValueError("the section slurm requires cluster: slurm")
         return self

@@ -1,4 +1,4 @@
-"""Typed configuration: one file is one run, with a section per stage; fields that are left out have defaults."""
+"""Typed configuration: one file is one run, with a section per stage. Omitted fields have defaults."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ CHECKOUT = (
     *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),
     *("tasks", "tests"),
 )
-"""Folders of a checkout that no run may use: tracked folders, git's folder, the packages and the user's own tasks."""
+"""Folders of a checkout that no run may use: tracked folders, git's folder, the packages and the user's tasks."""
 
 
 class DemosConfig(Frozen):
-    """Demonstrations to start from.
+    """Demonstrations that a run perturbs.
 
     Attributes:
-        source: ``starter`` for the 130 demonstrations that a Python package carries, ``hdf5`` for LIBERO's own files;
-            when left out, as ``root`` says.
-        root: folder with ``<suite>/<task>_demo.hdf5``; only with ``source: hdf5``.
-        tasks: shell-style patterns matched against ``<suite>/<task>``.
-        per_task: at most so many demonstrations of each task; all of them when left out.
+        source: ``starter`` selects the 130 demonstrations of a Python package, ``hdf5`` selects the files in ``root``.
+            The default is ``hdf5`` if ``root`` is set, else ``starter``.
+        root: Folder with files ``<suite>/<task>_demo.hdf5``; none by default.
+        tasks: Shell-style patterns of ``<suite>/<task>``; by default the tasks of the four suites.
+        per_task: Largest number of demonstrations of each task; by default all of them.
     """
 
     source: Literal["starter", "hdf5"] = "starter"
@@ -56,20 +56,20 @@ class DemosConfig(Frozen):
         fitting = "starter" if raw.get("root") is None else "hdf5"
         source = raw.get("source", fitting)
         if source != fitting and "hdf5" in (source, fitting):
-            raise ValueError("root goes with source: hdf5, and only with it")
+            raise ValueError("source: hdf5 and root require each other")
         return {**raw, "source": source}
 
     def open(self) -> DemoSource:
         return StarterSource() if self.root is None else HDF5Source(self.root)
 
     def index(self) -> DemoIndex:
-        """Return the demonstrations that a run starts from, and the demonstrations that cannot be used."""
+        """Return the usable demonstrations of the selected tasks, and the problems of unusable ones."""
         return self.open().index(select_tasks(self.tasks), self.per_task)
 
     def refuse_tasks_without(self, entries: Sequence[DemoEntry]) -> None:
-        """Reject a chosen task without any of ``entries``.
+        """Reject selected tasks without any of ``entries``.
 
-        Other tasks would be planned in its place, and its finished work would be deleted.
+        Other tasks would be planned in their place, and their finished work would be deleted.
 
         Raises:
             PipelineError: naming the tasks.
@@ -78,9 +78,9 @@ class DemosConfig(Frozen):
         without = [str(task) for task in select_tasks(self.tasks) if task not in usable]
         if without:
             raise PipelineError(
-                f"{len(without)} of the chosen tasks have no usable demonstration: {', '.join(without)}",
+                f"{len(without)} of the selected tasks have no usable demonstration: {', '.join(without)}",
                 where=self.root,
-                remedy="get their demonstrations, or leave them out of demos.tasks",
+                remedy="add demonstrations of these tasks, or exclude the tasks from demos.tasks",
             )
 
 
@@ -88,12 +88,12 @@ class PlanConfig(Frozen):
     """Episodes to plan from the demonstrations.
 
     Attributes:
-        seed: every random draw of the run is keyed by it.
-        axes: the ranges each axis draws from; the default ones where an axis of ``episodes`` is not named.
-        episodes: how many kept episodes are wanted, spread evenly over the tasks: for an axis of ``axes``, or for
-            several that perturb each episode together, joined by + in any order, such as ``camera+light+language``.
-        reserve: share of further candidates to draw of each task, rounded up. The one that is most like an episode that
-            fails, by level and component, replaces it.
+        seed: Key of every random value of the run.
+        axes: Ranges of each axis; default ranges for an axis of ``episodes`` that is not listed.
+        episodes: Number of kept episodes to generate of each axis, spread evenly over the tasks. Axes joined by ``+``
+            in any order, such as ``camera+light+language``, perturb the same episode.
+        reserve: Share of additional candidates of each task, 0 to 10, rounded up; 0.5 by default. A failed episode is
+            replaced by the reserve with the nearest level, then the same component.
     """
 
     seed: int = Field(default=0, ge=-(2**63), lt=2**63)
@@ -119,7 +119,7 @@ class PlanConfig(Frozen):
         for written, count in episodes.items():
             name = "+".join(axes_of(written))
             if name in named:
-                raise ValueError(f"{name!r} is asked for twice, in two orders")
+                raise ValueError(f"{name!r} is listed twice, in two orders")
             named[name] = count
         return named
 
@@ -150,14 +150,14 @@ class ReplayConfig(Frozen):
     """Options of the replay of demonstrations.
 
     Attributes:
-        mode: ``open_loop`` sends the recorded actions as they are (the paper's way); ``tracked`` follows what the
-            hand did in a successful replay by feedback; ``auto`` does so only where open-loop fails.
-        noops: ``drop`` skips every no-op (OpenVLA's rule), ``trim_ends`` only those before the first and after the
-            last real action, ``keep`` none.
-        settle_steps: control steps of doing nothing with the gripper open before the first frame and action, as in
-            every evaluation and in OpenVLA's own regeneration of LIBERO's demonstrations.
-        fixture_seed: seeds LIBERO's reset where the source did not record the scene. Under the default 38 of the 40
-            starter demonstrations of the four suites reach their goal open-loop, settled.
+        mode: ``open_loop`` sends the recorded actions unchanged, as the paper does. ``tracked`` follows the hand's path
+            of a successful replay by feedback. ``auto``, the default, tracks only if the open-loop replay fails.
+        noops: ``drop``, the default, skips every no-op, as OpenVLA does. ``trim_ends`` skips only the no-ops before the
+            first and after the last real action. ``keep`` skips none.
+        settle_steps: Control steps without action, with an open gripper, before the first frame; 10 by default. Every
+            evaluation has these steps, and so has OpenVLA's own regeneration of LIBERO's demonstrations.
+        fixture_seed: Seed of LIBERO's reset if the source did not record the scene. With the default 0, after settling,
+            38 of the 40 starter demonstrations of the four suites reach their goal open-loop.
     """
 
     mode: Literal["open_loop", "tracked", "auto"] = "auto"
@@ -167,13 +167,21 @@ class ReplayConfig(Frozen):
 
 
 class FilterConfig(Frozen):
-    """Limits by which successful replays are dropped, named after columns of the manifest; no limits by default.
+    """Limits of the quality of successful replays, named after columns of the manifest; no limits by default.
 
-    An episode is dropped, with the column as its reason, where the figure is above the limit, or below it in
-    ``joint_margin_rad``; then reserves take its place. Trajectories stay as they are.
+    An episode beyond a limit is dropped, with the column as its reason, and a reserve replaces it. Its trajectory stays
+    stored.
 
     Attributes:
-        exceeds_step_limit: ``drop`` leaves out what takes more control steps than an evaluation of its suite allows.
+        non_target_moved_m: Largest displacement of another object at any step, in m, from the first observation.
+        non_target_left_m: Largest displacement of another object after the last step, in m.
+        touched_steps: Largest number of steps after which the robot touches a thing that is not part of the goal.
+        path_m: Largest length of the end effector's path, in m.
+        jerk_rms_m_s3: Largest root mean square of the end effector's jerk, in m/s^3.
+        idle_share: Largest share of steps, 0 to 1, in which hand and fingers hardly move.
+        joint_margin_rad: Smallest distance of a joint of the arm to its limit, in rad.
+        lag_m: Largest distance between the commanded and the reached position of the hand at a step, in m.
+        exceeds_step_limit: ``drop`` drops episodes with more control steps than an evaluation of their suite allows.
     """
 
     non_target_moved_m: float | None = Field(default=None, ge=0.0)
@@ -196,11 +204,13 @@ class FilterConfig(Frozen):
 
 
 class RenderConfig(Frozen):
-    """Options of rendering; the size is that of ``schemas/episode.json``.
+    """Options of rendering. ``schemas/episode.json`` states the size of the frames.
 
     Attributes:
-        extras: what is made beside the frames, and put into all datasets: ``depth`` and ``segmentation`` of both views,
-            and ``object_poses``.
+        encoding: File format of the frames; only ``jpeg`` exists.
+        jpeg_quality: JPEG quality of the frames, 50 to 100; 95 by default.
+        extras: Further content of all datasets: ``depth`` and ``segmentation`` of both views, and ``object_poses``;
+            none by default.
     """
 
     encoding: Literal["jpeg"] = "jpeg"
@@ -209,11 +219,20 @@ class RenderConfig(Frozen):
 
 
 class Config(Frozen):
-    """A whole run.
+    """Configuration of a whole run.
 
     Attributes:
-        name: of the run, and of its folder; at most 60 characters.
-        folder: that the folders of runs lie in.
+        name: Name of the run and of its folder: at most 60 small letters, digits and underscores, beginning with a
+            letter.
+        folder: Folder that contains the folder of the run; ``data`` by default.
+        demos: Demonstrations that the run perturbs; by default the starter set of the four suites.
+        plan: Episodes to plan from the demonstrations.
+        replay: Options of the replay of demonstrations.
+        filter: Limits of the quality of successful replays; none by default.
+        render: Options of rendering.
+        export: Output formats and their options; by default RLDS and LeRobot.
+        compute: Place of the computation; by default all cores of this machine.
+        publish: Statements of the dataset card; none by default.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=LONGEST_NAME)
@@ -242,7 +261,7 @@ class Config(Frozen):
                 if len(name) > LONGEST_NAME:
                     raise ValueError(
                         f"tasks: the name of the {kind} {name} has {len(name)} characters, expected at most "
-                        f"{LONGEST_NAME}, as paths of datasets contain it: rename it"
+                        f"{LONGEST_NAME}, because paths of datasets contain it; rename the {kind}"
                     )
         if demos.root is None and own_tasks:
             raise ValueError(f"the starter set has no demonstration of {own_tasks[0]}: set root")
@@ -260,10 +279,10 @@ class Config(Frozen):
     def _sections_agree(self) -> Config:
         chosen, axes = select_tasks(self.demos.tasks), self.plan.axes
         if axes.disturbance and self.replay.noops != "drop":
-            raise ValueError("pushes count steps without no-ops: the axis disturbance goes with replay.noops: drop")
+            raise ValueError("the axis disturbance requires replay.noops: drop, as pushes count steps without no-ops")
         if axes.disturbance and self.replay.mode == "open_loop":
             raise ValueError(
-                "recorded actions do not work against pushes: disturbance goes with replay.mode: auto or tracked"
+                "the axis disturbance requires replay.mode: auto or tracked, as recorded actions do not correct pushes"
             )
         if axes.language:
             # The shipped bank has no rewrites of LIBERO-90.
@@ -276,8 +295,8 @@ class Config(Frozen):
                     without.append(str(task))
             if without:
                 raise ValueError(
-                    f"plan.axes.language: no rewrites of {len(without)} tasks, such as {without[0]}; leave language "
-                    "out, leave them out of demos.tasks, or name a bank that has some (the command rewrite makes one)"
+                    f"plan.axes.language: {len(without)} tasks have no rewrites, such as {without[0]}; leave language "
+                    "out, exclude the tasks from demos.tasks, or name a bank that the command rewrite has written"
                 )
         components = {CLEAN}
         for axis in axes.configured():
@@ -290,24 +309,26 @@ class Config(Frozen):
         for field, values in values_of_run.items():
             for value in getattr(self.export.where, field, None) or ():
                 if value not in values:
-                    raise ValueError(f"export.where.{field}: the run has no {value!r}, expected of {sorted(values)}")
+                    raise ValueError(
+                        f"export.where.{field}: the run has no {value!r}, expected values {sorted(values)}"
+                    )
         return self
 
     @model_validator(mode="after")
     def _folder_of_its_own(self) -> Config:
-        """Reject a run's folder in which stages would delete files that are not of the run."""
+        """Reject a folder in which stages would delete files that do not belong to the run."""
         data = self.data.resolve()
         for root in {Path.cwd(), Path(__file__).resolve().parents[1]}:
             nested = next((root / name for name in CHECKOUT if _nested(data, (root / name).resolve())), None)
             if nested or root.is_relative_to(data):
-                raise ValueError(f"folder: {data} is, is in or contains the folder {nested or root} of the checkout")
+                raise ValueError(f"folder: {data} overlaps with the folder {nested or root} of the checkout")
         if Path.home().resolve().is_relative_to(data):
             raise ValueError(f"folder: {data} is or contains the home folder")
         for shared in (texture_sources.FOLDER, object_sources.FOLDER, benchmark.FOLDER):
             if _nested(data, shared.resolve()):
-                raise ValueError(f"name: all runs share the folder {shared}; take another name")
+                raise ValueError(f"name: all runs share the folder {shared}; choose another name")
         if self.demos.root is not None and _nested(data, self.demos.root.resolve()):
-            raise ValueError(f"folder: {data} is, is in or contains demos.root, {self.demos.root}")
+            raise ValueError(f"folder: {data} overlaps with demos.root, {self.demos.root}")
         return self
 
     @property
@@ -332,9 +353,13 @@ def load(path: Path) -> Config:
         return Config.model_validate(yaml.load(path.read_text(encoding="utf-8"), StrictLoader))
     except (OSError, UnicodeDecodeError) as error:
         files = sorted(map(str, Path("configs").glob("*")))
-        raise PipelineError(f"cannot read the configuration ({error})", where=path, remedy=f"one of {files}") from error
+        raise PipelineError(
+            f"cannot read the configuration ({error})", where=path, remedy=f"name one of {files}"
+        ) from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise PipelineError(f"not valid YAML: {error}", where=path, expected="a file like those of configs/") from error
+        raise PipelineError(
+            f"the file is not valid YAML: {error}", where=path, expected="a file such as configs/starter.yaml"
+        ) from error
     except ValidationError as error:
         faults = "\n    ".join(describe(error, Config))
         raise PipelineError(

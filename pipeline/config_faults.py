@@ -38,7 +38,7 @@ EXPECTED = {
     "string_too_short": "at least {min_length} characters",
     "finite_number": "a finite number",
 }
-"""Type of an error of pydantic to the words for what was expected."""
+"""Type of a pydantic error to the words for the expected value."""
 
 PATTERNS = {
     r"^[a-z][a-z0-9_]*$": "a lower-case letter, then lower-case letters, digits or underscores",
@@ -77,7 +77,7 @@ def _sentence(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
             return "this field is required"
         case "extra_forbidden":
             *parents, name = fault["loc"]
-            return f"there is no such field; {_suggestion(str(name), _fields_at(model, tuple(parents)))}"
+            return f"unknown field; {_suggestion(str(name), _fields_at(model, tuple(parents)))}"
         case "string_pattern_mismatch":
             pattern = context["pattern"]
             return f"expected {PATTERNS.get(pattern, f'text that matches {pattern}')}, got {given}"

@@ -165,7 +165,7 @@ def named(extras: Collection[Extra]) -> bool:
 
 
 def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
-    """Reject an episode that training would misread or fail on.
+    """Reject an episode that training code would misread or fail on.
 
     Args:
         extras: the extras that the episode must have in addition to the frames.
@@ -175,7 +175,7 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     """
     steps = len(episode)
     if steps < SCHEMA.min_steps:
-        expected = f"at least {SCHEMA.min_steps}, the chunk policies predict"
+        expected = f"at least {SCHEMA.min_steps} steps, the length of the chunks that policies predict"
         raise _fault(episode, "action", f"has {steps} steps", expected)
     for name in MOTION:
         _check_array(episode, name, getattr(episode, name), getattr(SCHEMA, name), steps)
@@ -187,7 +187,7 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     _check_geometry(episode, steps, extras)
     if not episode.instruction.strip() or "_" in episode.instruction:
         # OpenVLA-OFT's loader never returns on an empty text; an underscore indicates a file name.
-        raise _fault(episode, "instruction", f"is {episode.instruction!r}", "words, without underscores")
+        raise _fault(episode, "instruction", f"is {episode.instruction!r}", "words without underscores")
     columns = provenance_of(extras)
     if set(episode.provenance) != set(columns):
         wrong = sorted(set(episode.provenance) ^ set(columns))
@@ -240,14 +240,15 @@ def _check_geometry(episode: Episode, steps: int, extras: Collection[Extra]) -> 
         lengths = {name: len(files) for name, files in geometry.maps.items()}
         wanted = {name: steps for name in MAPS if name in extras}
         if lengths != wanted:
-            raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each that is asked for")
+            raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each requested map")
     if ("object_poses" in extras) != (episode.object_poses is not None):
         expected = "poses if, and only if, render.extras lists them"
         raise _fault(episode, "object_poses", "are missing or not requested", expected)
     if episode.object_poses is not None:
         _check_array(episode, "object_poses", episode.object_poses, SCHEMA.object_poses, steps)
     if named(extras) != bool(episode.instances):
-        raise _fault(episode, "instances", f"has {len(episode.instances)} names", "some with segmentation or poses")
+        expected = "names if, and only if, render.extras lists segmentation or object_poses"
+        raise _fault(episode, "instances", f"has {len(episode.instances)} names", expected)
 
 
 def _check_array(
@@ -257,7 +258,7 @@ def _check_array(
         expected = f"{(*steps, *spec.shape)} of {spec.dtype}"
         raise _fault(episode, field, f"is {values.shape} of {values.dtype}", expected)
     if not np.isfinite(values).all():
-        raise _fault(episode, field, "holds NaN or infinity", "finite numbers")
+        raise _fault(episode, field, "contains NaN or infinity", "finite numbers")
 
 
 def _fault(episode: Episode, field: str, what: str, expected: str) -> PipelineError:

@@ -9,24 +9,24 @@ from types import FrameType
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
 
-GO_ON = "run the same command again: what is finished is kept"
+GO_ON = "run the same command again, which keeps finished work"
 
 SURROUNDINGS = {
     errno.ENOSPC: (
         "the disk is full",
-        f"make room (`python -m pipeline doctor CONFIG` says how much), and {GO_ON}",
+        f"free space (`python -m pipeline doctor CONFIG` reports the need), and {GO_ON}",
     ),
-    errno.EDQUOT: ("your share of the disk is used up", f"make room, and {GO_ON}"),
-    errno.EROFS: ("this file system cannot be written to", f"mount it for writing, and {GO_ON}"),
-    errno.EACCES: ("you may not read or write this", f"change its permissions or its owner, and {GO_ON}"),
-    errno.EPERM: ("you may not change this", f"change its permissions or its owner, and {GO_ON}"),
-    errno.ENOENT: ("not there", f"`{MAKE_AGAIN}` makes everything that a stage needs, in order"),
-    errno.ENOTDIR: ("a file is where a folder should be", f"move it away, and {GO_ON}"),
-    errno.EEXIST: ("something else is where a folder should be", f"move it away, and {GO_ON}"),
-    errno.EISDIR: ("a folder is where a file should be", f"move it away, and {GO_ON}"),
-    errno.ELOOP: ("symbolic links lead in a circle", f"remove them, and {GO_ON}"),
+    errno.EDQUOT: ("your disk quota is used up", f"free space or raise the quota, and {GO_ON}"),
+    errno.EROFS: ("the file system is read-only", f"mount it for writing, and {GO_ON}"),
+    errno.EACCES: ("you have no permission to read or write it", f"change its permissions or its owner, and {GO_ON}"),
+    errno.EPERM: ("you have no permission to change it", f"change its permissions or its owner, and {GO_ON}"),
+    errno.ENOENT: ("the file is missing", f"run `{MAKE_AGAIN}`, which performs all stages in order"),
+    errno.ENOTDIR: ("a file is in the place of a folder", f"move it to another place, and {GO_ON}"),
+    errno.EEXIST: ("an existing file is in the place of a folder", f"move it to another place, and {GO_ON}"),
+    errno.EISDIR: ("a folder is in the place of a file", f"move it to another place, and {GO_ON}"),
+    errno.ELOOP: ("symbolic links form a cycle", f"correct the links, and {GO_ON}"),
     errno.EMFILE: ("too many files are open", f"raise the limit (`ulimit -n 4096`), and {GO_ON}"),
-    errno.EIO: ("the disk has an error", "`python -m pipeline dataset check CONFIG` says which files are whole"),
+    errno.EIO: ("the disk has an error", "run `python -m pipeline dataset check CONFIG`, which lists damaged files"),
 }
 """Error number of the system to its description and remedy. All other errors are bugs and keep their traceback."""
 
@@ -49,7 +49,7 @@ def exit_status(command: Callable[[], int]) -> int:
     except KeyboardInterrupt as stopped:
         return _told(f"stopped; {GO_ON}", 143 if isinstance(stopped, Terminated) else 130)
     except MemoryError:
-        return _told(f"not enough memory\n  try: fewer workers, and {GO_ON}", 1)
+        return _told(f"not enough memory\n  try: reduce compute.workers, and {GO_ON}", 1)
     except OSError as error:
         if error.errno not in SURROUNDINGS:
             raise

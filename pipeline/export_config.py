@@ -1,4 +1,4 @@
-"""The configuration's section ``export``: the options of each requested format, and which episodes go in."""
+"""The configuration's section ``export``: the options of each requested format, and the filter of episodes."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ CLEAN = "clean"
 
 
 class Where(Frozen):
-    """Filter of the kept episodes: an episode is written if its value is listed in each field that is not left out.
+    """Filter of the kept episodes: an episode is written if every stated field lists its value.
 
     A clean twin has the axis and the component ``clean`` and the level 0.
 
     Attributes:
-        axis: names as in ``plan.episodes``.
-        component, level: of an episode of several axes, all have to be listed.
-        suite: LIBERO's.
+        axis: Axes and combinations to write, as in ``plan.episodes``; by default all of them.
+        component: Components to write; by default all of them. An episode of several axes is written if all its
+            components are listed.
+        level: Levels to write, 0 to 5; by default all of them. An episode of several axes is written if all its levels
+            are listed.
+        suite: Suites to write; by default all of them.
     """
 
     axis: tuple[str, ...] | None = Field(default=None, min_length=1)
@@ -63,14 +66,16 @@ else:
 
 
 class ExportConfig(_Formats):
-    """The output formats, and which of the kept episodes they get.
+    """The output formats, and the filter of the kept episodes.
 
     Attributes:
-        rlds, lerobot: null leaves a format out.
-        lerobot_v21: the same episodes for clients that read LeRobot's older version.
-        lerobot_openpi: the same episodes in openpi's convention of this version, also next to ``lerobot_v21``.
-        where: a subset of the kept episodes; all of them when left out.
-        failures: write replays that missed their goal too, into sets of their own below ``failures/``.
+        rlds: Options of the RLDS datasets; ``null`` leaves the format out.
+        lerobot: Options of the LeRobot dataset; ``null`` leaves the format out.
+        lerobot_v21: Options of additional datasets for clients that read LeRobot v2.1; left out by default.
+        lerobot_openpi: Options of an additional dataset of this version in openpi's convention; left out by default.
+        where: Filter of the kept episodes; by default all of them are written.
+        failures: True also writes replays that missed their goal, into separate datasets below ``failures/``; false by
+            default.
     """
 
     # Excluded at their defaults, as formats that were added later.
@@ -120,7 +125,7 @@ class ExportConfig(_Formats):
         return self.model_copy(update=formats)
 
     def of_failures(self) -> ExportConfig:
-        """Return the options for failures: under another name, without a validation split, and otherwise unchanged."""
+        """Return the options for failures, which differ in the name and have no validation split."""
         formats = {}
         for format_name, options in self.formats.items():
             changes = {"name": f"{options.name}_failures", "validation": 0.0}

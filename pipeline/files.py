@@ -1,4 +1,4 @@
-"""Files that are either whole or missing."""
+"""Files that are either complete or missing."""
 
 import json
 import os
@@ -66,23 +66,26 @@ def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
     try:
         content = json.loads(file.read_bytes())
         if not isinstance(content, dict):
-            raise TypeError(f"holds {type(content).__name__}")
+            raise TypeError(f"it contains {type(content).__name__}")
     except FileNotFoundError as error:
-        raise PipelineError("not there", where=file, remedy=remedy) from error
+        raise PipelineError("the file is missing", where=file, remedy=remedy) from error
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise PipelineError(
-            f"damaged ({error})", where=file, expected="a JSON object", remedy=f"move it away, and {remedy}"
+            f"the file is damaged ({error})",
+            where=file,
+            expected="a JSON object",
+            remedy=f"move it to another place, and {remedy}",
         ) from error
     return content
 
 
 def write_json(file: Path, content: object) -> None:
-    """Write a file that ``read_json`` reads; it is whole or missing."""
+    """Write a file that ``read_json`` reads; it is complete or missing."""
     write(file, json.dumps(content, indent=1) + "\n")
 
 
 def write(file: Path, content: str | bytes) -> None:
-    """Write a file, text as UTF-8; it is whole or missing."""
+    """Write a file, text as UTF-8; it is complete or missing."""
     with replaced(file) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -99,10 +102,10 @@ def refuse_other_file(path: Path, mark: str) -> None:
     if not os.path.lexists(path) or (path.is_file() and mark.encode() in path.read_bytes()):
         return
     raise PipelineError(
-        "is another file, and would be overwritten",
+        "the command did not write this file, and would overwrite it",
         where=path,
         expected="a new name, or a file that the same command wrote",
-        remedy="name another file, or move this one",
+        remedy="choose another name, or move the file to another place",
     )
 
 
@@ -165,7 +168,7 @@ def keep_below(folder: Path, files: set[Path], made: Callable[[Path], bool] = la
     Deleted files are, for example, shards of an earlier plan, and temporaries of a killed run.
 
     Args:
-        made: returns True if this project wrote a file. All other files stay.
+        made: function that returns True for a file of this project. All other files stay.
     """
     if not folder.is_dir():
         return
@@ -192,7 +195,7 @@ def is_temporary(name: str, of: str | None = None) -> bool:
 def remove_leftovers(folder: Path) -> None:
     """Delete temporaries that killed processes left in a folder during ``replaced``.
 
-    The caller must hold a lock that keeps all other processes, on every host, from writing to the folder. The name of a
+    The caller must have a lock that keeps all other processes, on every host, from writing to the folder. The name of a
     temporary does not show if its process still lives on another host.
     """
     for entry in folder.glob(".*.tmp"):  # Nothing if the folder does not exist.

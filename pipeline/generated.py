@@ -1,4 +1,4 @@
-"""Folders that a stage generates and a person may edit (``card/``, ``finetune/``): no edit is overwritten silently.
+"""Folders that a stage generates and a person may edit (``card/``, ``finetune/``). No edit is overwritten silently.
 
 The SHA-256 of every generated file is recorded in the folder itself, so that one rename puts both in place.
 """
@@ -58,7 +58,9 @@ def read_record(folder: Path) -> Record:
     try:
         files, made_from = dict(content["files"]), dict(content["made_from"])
     except (KeyError, TypeError, ValueError) as error:
-        raise PipelineError(f"damaged ({error!r})", where=file, expected="files and made_from") from error
+        raise PipelineError(
+            f"the record is damaged ({error!r})", where=file, expected="the fields files and made_from"
+        ) from error
     return Record(Basis.of(made_from, {}), files)
 
 
@@ -100,23 +102,23 @@ def unchanged(folder: Path, below: str = "") -> dict[str, Path]:
         PipelineError: naming files that were changed, added, linked or deleted since the folder was generated.
     """
     if folder.is_symlink():
-        raise PipelineError("is a symbolic link", where=folder, expected="the folder that a stage generated")
+        raise PipelineError("the folder is a symbolic link", where=folder, expected="the folder that a stage generated")
     recorded = [path for path in read_record(folder).files if PurePosixPath(path).is_relative_to(below)]
     faults = {path: how for path, how in edits(folder).items() if PurePosixPath(path).is_relative_to(below)}
-    faults |= {path: "not there" for path in recorded if not os.path.lexists(folder / path)}
+    faults |= {path: "missing" for path in recorded if not os.path.lexists(folder / path)}
     if faults:
         raise PipelineError(
-            f"{len(faults)} files are not as they were generated: {in_words(faults)}",
+            f"{len(faults)} files differ from the generated ones: {in_words(faults)}",
             where=folder,
-            expected=f"the files of {folder / RECORD}, and no others",
-            remedy=f"{REMEDY}; for files that are not there `{MAKE_AGAIN}`",
+            expected=f"exactly the files that {folder / RECORD} lists",
+            remedy=f"{REMEDY}; generate missing files again by `{MAKE_AGAIN}`",
         )
     return {path: folder / path for path in recorded}
 
 
 REMEDY = (
-    "put a change into the configuration (`publish:` has licence, author and notes), or keep a copy of these files "
-    f"outside of the folder and allow to generate it again: {ALLOW}"
+    "move the changes into the configuration (`publish:` has licence, author and notes), or copy the files to another "
+    f"folder and allow this one to be generated again: {ALLOW}"
 )
 """The two ways to keep an edit."""
 
@@ -127,7 +129,7 @@ def edits_in_words(data: Path) -> Iterator[str]:
         edits_of_folder = edits(data / name)
         if edits_of_folder:
             words = in_words(edits_of_folder)
-            yield f"edited in {data / name}: {words}. Before a run overwrites them, it stops: {REMEDY}"
+            yield f"edited files in {data / name}: {words}. A run stops before it overwrites them: {REMEDY}"
 
 
 def in_words(found: Mapping[str, str]) -> str:
@@ -148,12 +150,12 @@ def _refuse_loss(folder: Path, files: Mapping[str, str]) -> None:
     if not lost:
         return
     if os.environ.get(REMAKE) == "1":
-        print(f"generated again in {folder}, edits included: {in_words(lost)}")
+        print(f"generated {folder} again, and replaced the edited files {in_words(lost)}")
         return
     raise PipelineError(
         f"{len(lost)} edited files would be overwritten or deleted: {in_words(lost)}",
         where=folder,
-        expected=f"the files of {folder / RECORD}, as they were generated",
+        expected=f"the files that {folder / RECORD} lists, unchanged",
         remedy=REMEDY,
     )
 

@@ -1,7 +1,7 @@
 """Choice of the OpenGL renderer: a GPU through EGL, else Mesa in software through EGL, else OSMesa.
 
-The first renderer of a process triggers the choice, and an import never does: physics needs no OpenGL. Worker processes
-inherit the choice. Two renderers may differ by some grey levels, so the choice is printed and recorded.
+The first renderer of a process triggers the choice. An import never does, because physics needs no OpenGL. Worker
+processes inherit the choice. Two renderers may differ by some grey levels, so the choice is printed and recorded.
 """
 
 import ctypes
@@ -22,14 +22,14 @@ from typing import Any
 from pipeline.errors import PipelineError
 
 BACKENDS = ("egl", "osmesa")
-REMEDY = "apt-get install -y libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libosmesa6   (as root, or let setup.sh do it)"
+REMEDY = "run setup.sh, or as root `apt-get install -y libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libosmesa6`"
 NVIDIA_EGL = "libEGL_nvidia.so.0"
 VENDOR_FOLDERS = "/etc/glvnd/egl_vendor.d:/usr/share/glvnd/egl_vendor.d"
 DEVICES, LOADED_GPUS = Path("/dev"), Path("/proc/driver/nvidia/gpus")
 
 
-ASKED = "MUJOCO_GL asks for it"
-"""Reason of a choice that the user made."""
+ASKED = "selected by MUJOCO_GL"
+"""Reason of a choice by the user."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,8 @@ def choose() -> GlChoice:
 
     what = "; ".join(f"{backend} fails: {fault}" for backend, fault in faults.items())
     raise PipelineError(
-        f"{f'MUJOCO_GL={asked} does not render' if asked else 'no OpenGL renders'} here ({what or 'unknown'})",
+        f"{f'MUJOCO_GL={asked} does not render' if asked else 'no OpenGL back end renders'} here "
+        f"({what or 'unknown back end'})",
         expected=" or ".join(BACKENDS),
         remedy=f"unset MUJOCO_GL; {REMEDY}" if asked else REMEDY,
     )
@@ -105,7 +106,7 @@ def check_device() -> None:
     """Compare ``MUJOCO_EGL_DEVICE_ID`` with ``CUDA_VISIBLE_DEVICES``; robosuite cannot be imported if they disagree.
 
     Raises:
-        PipelineError: when the first is not among the second.
+        PipelineError: when ``CUDA_VISIBLE_DEVICES`` does not list the device.
     """
     device, visible = os.environ.get("MUJOCO_EGL_DEVICE_ID"), _visible_devices()
     if device is None or not visible or (device.isdigit() and device in visible):
@@ -113,7 +114,7 @@ def check_device() -> None:
     named = [number for number in visible if number.isdigit()]
     raise PipelineError(
         f"MUJOCO_EGL_DEVICE_ID={device} is not among CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']}",
-        expected="one of its numbers, as robosuite renders on no other GPU",
+        expected="a number of CUDA_VISIBLE_DEVICES, as robosuite renders on no other GPU",
         remedy=f"export MUJOCO_EGL_DEVICE_ID={named[0]}, or unset it" if named else "unset MUJOCO_EGL_DEVICE_ID",
     )
 
@@ -141,7 +142,7 @@ def gpus() -> tuple[str, ...]:
         try:
             device = _probe("egl", index)
         except _NoDeviceError:
-            # No GPU has that number: EGL counts without gaps.
+            # No GPU has this number, as EGL counts without gaps.
             break
         if device == choice.device:
             indices.append(index)
@@ -161,7 +162,7 @@ class WorkerSetup:
         self._environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
 
     def __call__(self, worker: int) -> None:
-        """Make this process, the worker of that number, render with the choice, on one of several GPUs in turn."""
+        """Make this process, the worker with this number, render with the choice, on one of several GPUs in turn."""
         global _of_the_run
         _of_the_run = self._choice
         os.environ.update(self._environment)
@@ -186,7 +187,7 @@ def import_mujoco() -> None:
 
 @contextmanager
 def left_out() -> Iterator[None]:
-    """Keep MuJoCo and robosuite from loading OpenGL when they are imported in the block, whatever ``MUJOCO_GL`` names.
+    """Keep MuJoCo and robosuite from loading OpenGL when the block imports them, for any value of ``MUJOCO_GL``.
 
     Raises:
         PipelineError: as ``check_device``.
@@ -209,7 +210,7 @@ class _NoDeviceError(Exception):
 def _best_device(backend: str) -> tuple[str, str | None]:
     """Return the first GPU, or else the first renderer: its name and the ``MUJOCO_EGL_DEVICE_ID`` that it needs."""
     index = os.environ.get("MUJOCO_EGL_DEVICE_ID")
-    # Render on the GPU that the job was given, if EGL and CUDA count alike: robosuite follows the same rule, and
+    # Render on the GPU of the job, if EGL and CUDA use the same numbers: robosuite follows the same rule, and
     # rejects a device that is not in this list. Without an index MuJoCo uses the first device that answers.
     first_visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0]
     if backend == "egl" and index is None and first_visible.isdigit():
@@ -221,7 +222,7 @@ def _best_device(backend: str) -> tuple[str, str | None]:
 
 
 def _probe(backend: str, index: str | None) -> str:
-    """Render one frame in a process of its own, as a broken driver may take its process down."""
+    """Render one frame in a separate process, because a broken driver may end its process."""
     environment = os.environ | {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     if index is not None:
         environment["MUJOCO_EGL_DEVICE_ID"] = index
@@ -248,30 +249,31 @@ def idle_gpu() -> tuple[str, str] | None:
             closed.append(node)
     if not nvidia and LOADED_GPUS.is_dir():
         return (
-            f"NVIDIA's driver is loaded, but there is no {DEVICES}/nvidia0",
-            "as root: nvidia-modprobe -u -c=0; in a container, hand the GPU on: --nv (Apptainer), "
-            "--device nvidia.com/gpu=all (Podman), --gpus all (Docker)",
+            f"NVIDIA's driver is loaded, but {DEVICES}/nvidia0 is missing",
+            "run `nvidia-modprobe -u -c=0` as root; start a container with --nv (Apptainer), "
+            "--device nvidia.com/gpu=all (Podman) or --gpus all (Docker)",
         )
     if nvidia and not _loads(NVIDIA_EGL):
         return (
             f"{NVIDIA_EGL} is missing",
             "install the driver's EGL library (Debian: libegl-nvidia0, Ubuntu: libnvidia-gl-VERSION); in a container, "
-            "have graphics among NVIDIA_DRIVER_CAPABILITIES",
+            "add graphics to NVIDIA_DRIVER_CAPABILITIES",
         )
     if nvidia and not any(NVIDIA_EGL in file.read_text(errors="replace") for file in _vendor_files()):
         vendor_file = json.dumps({"file_format_version": "1.0.0", "ICD": {"library_path": NVIDIA_EGL}})
         return (
             f"no EGL vendor file names {NVIDIA_EGL}",
-            f"echo '{vendor_file}' | sudo tee /usr/share/glvnd/egl_vendor.d/10_nvidia.json; "
+            f"run echo '{vendor_file}' | sudo tee /usr/share/glvnd/egl_vendor.d/10_nvidia.json; "
             "unset __EGL_VENDOR_LIBRARY_FILENAMES __EGL_VENDOR_LIBRARY_DIRS",
         )
     if closed:
         return (
-            f"this user may not open {closed[0]}",
-            f"sudo usermod -aG $(stat -c %G {closed[0]}) $USER, then log in again; in Podman, --group-add keep-groups",
+            f"this user has no permission to open {closed[0]}",
+            f"run sudo usermod -aG $(stat -c %G {closed[0]}) $USER, then log in again; in Podman, add "
+            "--group-add keep-groups",
         )
     if nvidia:
-        return "its driver does not answer", "see that nvidia-smi works; unset MUJOCO_GL MUJOCO_EGL_DEVICE_ID"
+        return "the GPU's driver does not answer", "check that nvidia-smi works; unset MUJOCO_GL MUJOCO_EGL_DEVICE_ID"
     return None
 
 
@@ -304,12 +306,12 @@ def _reason(backend: str, device: str, faults: dict[str, str]) -> str:
         return "a GPU"
     idle = idle_gpu()
     if idle:
-        return f"software, many times slower than the GPU that is there: {idle[0]}; {idle[1]}"
+        return f"software, many times slower than this machine's GPU, which does not render: {idle[0]}; {idle[1]}"
     return f"software, as EGL fails: {faults['egl']}" if backend == "osmesa" else "software, as no GPU answers"
 
 
 def _render_once() -> str:
-    """Render a frame, because a context alone proves little, and return the renderer of this process."""
+    """Render a frame, as a context alone proves little, and return the name of this process's renderer."""
     import mujoco
     from OpenGL import GL
 
@@ -323,6 +325,6 @@ def _render_once() -> str:
 if __name__ == "__main__":
     try:
         print(_render_once())
-    except Exception as error:  # drivers and loaders fail in many ways, and each is an answer here
+    except Exception as error:  # Drivers and loaders fail in many ways, and the caller reports each of them.
         print(f"{type(error).__name__}: {error}")
         sys.exit(1)

@@ -1,7 +1,7 @@
-"""Identity of finished work, which decides if the work is up to date; DVC decides only which stages start.
+"""Identity of finished work, which decides if the work is up to date. DVC decides only which stages start.
 
 1. A step generates files from inputs: physics generates trajectories, pixels frames, and encoding files of frames.
-2. A file is made with three things: recipe numbers, package versions, and the processor's machine code.
+2. The bytes of a file also depend on recipe numbers, package versions and the processor's machine code.
 3. A recipe is a number in ``RECIPES``; the recipe and the packages of a format are stated in its class. Raise a number
    in the commit that changes the results of the step, and only then.
 4. ``golden.json`` of the tests has the results of each number for short inputs. A test fails if only one of both
@@ -11,7 +11,7 @@
 7. The fingerprint of a file is a digest of recipes, packages, machine code and the settings that its bytes depend on.
 8. A file is named after its inputs, and is up to date if it has today's fingerprint. Else it counts as missing.
 9. A stage with few outputs (an export, ``validate``, ``summary``) has one record of all its inputs and outputs.
-   ``pipeline/record.py`` has the record, which also says why work is not up to date.
+   The record (``pipeline/record.py``) also states why work is not up to date.
 10. Before finished files of today's plan are generated again, a person must allow it (``refuse_unasked``).
 """
 
@@ -53,7 +53,10 @@ AFTER: dict[Step, tuple[Step, ...]] = {
     "checks": ("physics", "pixels", "encoding"),
     "pictures": ("physics", "pixels", "encoding"),
 }
-"""Steps that a step computes again, or whose files it reads; an export's inputs include its episodes' fingerprints."""
+"""Earlier steps that a step computes again, or whose files it reads.
+
+The inputs of an export include the fingerprints of its episodes.
+"""
 
 PACKAGES: dict[Step, tuple[str, ...]] = {
     "physics": (
@@ -75,7 +78,7 @@ DISTRIBUTION = "perturbed-libero"
 """Name of this project among installed packages; on PyPI, ``pipeline`` is another project."""
 
 REMAKE = "REMAKE"
-"""Environment variable that allows to generate finished files again: ``REMAKE=1`` before the command."""
+"""Environment variable that allows stages to generate finished files again: ``REMAKE=1`` before the command."""
 
 VERSIONS = {
     "pipeline": "this project",
@@ -101,7 +104,7 @@ def made_with(step: Step) -> dict[str, str]:
 
 
 def made_with_recipe(name: str, recipe: int, packages: Iterable[str]) -> dict[str, str]:
-    """Return the same as ``made_with`` of a recipe that is stated elsewhere: of a format, in its class."""
+    """Return ``made_with`` for a recipe that is not in ``RECIPES``, such as the recipe of a format's class."""
     origins.check()
     return _named({name: recipe}, _versions(packages), fixed_machine_code())
 
@@ -126,7 +129,7 @@ def fingerprint(step: Step, *settings: object) -> str:
     return digest(_parts(step), *settings)[:16]
 
 
-ALLOW = f"`{REMAKE}=1` before the command, or --remake behind one stage's"
+ALLOW = f"put `{REMAKE}=1` before the command, or --remake after the command of one stage"
 """Ways to allow that a stage generates finished files again, in words."""
 
 
@@ -145,13 +148,13 @@ def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
         return
     outdated = "; ".join(f"{number} {kind}" for kind, number in found.items())
     if os.environ.get(REMAKE) == "1":
-        print(f"made anew: {outdated}")
+        print(f"generating again: {outdated}")
         return
     raise PipelineError(
-        f"finished work would be made anew: {outdated}",
+        f"finished work would be generated again: {outdated}",
         where=where,
-        expected="the recipes, packages, machine code and OpenGL device that it was made with",
-        remedy=f"go on with the version and the machine that made it, or allow it: {allow}",
+        expected="the recipes, packages, machine code and OpenGL device that generated it",
+        remedy=f"use the version and the machine that generated it, or allow the change: {allow}",
     )
 
 

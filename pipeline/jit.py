@@ -56,7 +56,7 @@ def keeping_compiled() -> Iterator[None]:
         if "no locator available" not in str(error):
             raise
         raise PipelineError(
-            f"Numba has no folder to keep compiled loops in ({error})",
-            expected="a folder that can be written: that of the source, or ~/.cache/numba",
-            remedy="name one by the variable NUMBA_CACHE_DIR, such as `export NUMBA_CACHE_DIR=$PWD/numba`",
+            f"Numba has no folder for compiled loops ({error})",
+            expected="permission to write to the folder of the source or to ~/.cache/numba",
+            remedy="name a folder by the variable NUMBA_CACHE_DIR, such as `export NUMBA_CACHE_DIR=$PWD/numba`",
         ) from error

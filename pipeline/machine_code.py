@@ -1,7 +1,7 @@
-"""Machine code of NumPy and OpenBLAS: the one for AVX2, on every x86 processor that has it.
+"""Machine code of NumPy and OpenBLAS: the code for AVX2, on every x86 processor with AVX2.
 
-OpenBLAS and NumPy choose machine code by the processor. The last bits of a torque follow from that choice, and a
-contact amplifies them to decimetres. Under ``MACHINE_CODE_VARIABLES``, one demonstration has one trajectory everywhere.
+OpenBLAS and NumPy choose machine code by the processor. The choice changes the last bits of a torque, and a contact
+amplifies them to decimetres. Under ``MACHINE_CODE_VARIABLES``, a demonstration has the same trajectory everywhere.
 
 Both libraries read the variables once, when they are loaded. Therefore a program of this project starts itself again
 with them (``ensure_fixed_machine_code``), and its worker processes inherit them. An import changes nothing. A function
@@ -80,8 +80,8 @@ def fixed_machine_code() -> str:
     if as_fixed or widest in ("AVX", "baseline"):
         return machine_code()
     raise PipelineError(
-        f"NumPy computes with {machine_code()}: results differ in their last bits, which contacts magnify, so that no "
-        "file of a run can be read or written",
+        f"NumPy computes with {machine_code()}, so no file of a run can be read or written: results differ in their "
+        "last bits, and contacts amplify the differences",
         expected=f"{FIXED}, as in `python -m pipeline`",
         remedy=f"start your script with this prefix: env {in_shell(MACHINE_CODE_VARIABLES)} python ...",
     )

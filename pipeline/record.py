@@ -1,4 +1,4 @@
-"""Record of finished work: what it was generated from, what generated it, and its files.
+"""Record of finished work: its inputs, the recipes and versions that generated it, and its files.
 
 Every part of this project that skips finished work asks such a record whether the work is up to date: the files of the
 stores, the datasets, the outputs of the stages, and the results of an evaluation.
@@ -54,7 +54,7 @@ class Record:
         return self.basis.identity == basis.identity
 
     def same_request(self, basis: Basis) -> bool:
-        """Return whether the user asks for the same, so that only the installation or the machine can differ."""
+        """Return whether the requests are equal, so that only the installation or the machine can differ."""
         return bool(self.basis.requested == basis.requested)
 
     def why_not(self, basis: Basis, unnamed: Collection[str] = ()) -> str | None:
@@ -68,7 +68,7 @@ class Record:
         if not self.same_request(basis):
             names = list(_changed(self.basis.requested, basis.requested))
             further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-            return f"other {', '.join(names[:NAMED])}{further}"
+            return f"changed {', '.join(names[:NAMED])}{further}"
         return differences(self.basis.made_with, basis.made_with, unnamed)
 
 

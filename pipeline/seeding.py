@@ -1,4 +1,4 @@
-"""Keyed randomness: the same key gives the same numbers in any process, in any order."""
+"""Keyed randomness: equal keys give equal numbers in any process, in any order."""
 
 import hashlib
 import json

@@ -24,8 +24,8 @@ def perform_stage(script: str) -> None:
     names = [f"export_{group}" for group in GROUPS] if script == "exports" else [script]
     purposes = [f"Stage {name}: {STAGES[name].work.__doc__}" for name in names]
     parser = argparse.ArgumentParser(description=" ".join(purposes))
-    parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
-    parser.add_argument("--remake", action="store_true", help=f"make finished work again, as does {REMAKE}=1 before it")
+    parser.add_argument("config", type=Path, help="configuration file, such as configs/starter.yaml")
+    parser.add_argument("--remake", action="store_true", help=f"allow generating finished work again, as {REMAKE}=1")
     arguments = parser.parse_args()
     if arguments.remake:
         os.environ[REMAKE] = "1"

@@ -51,7 +51,7 @@ from pipeline.run.run import Run
 from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.testset import benchmark
 
-EVERY_TIME = "it runs every time"
+EVERY_TIME = "the stage runs every time"
 """Reason of a stage without outputs of its own, which decides itself if work is left."""
 
 
@@ -65,21 +65,22 @@ class Stage:
         settings: sections of ``settings.json`` that its outputs depend on.
         inputs: files and folders of the run that it reads.
         outputs: files and folders of the run that it writes.
-        whole: function that returns False if a stored file behind the outputs, such as a shard behind the record of its
-            dataset, was changed or deleted.
-        memory: function that returns the memory of the last call, instead of one of settings, inputs and outputs.
+        changed_file: function that returns a stored file behind the outputs that was changed or deleted, such as a
+            shard behind the record of its dataset; `None` if all of them are unchanged.
+        memory: function that returns the memory of the last call, if it does not follow from settings, inputs and
+            outputs.
     """
 
     work: Callable[[Run], None]
     settings: Sequence[str] = ()
     inputs: Sequence[str] = ()
     outputs: Sequence[str] = ()
-    whole: Callable[[Run], bool] | None = None
+    changed_file: Callable[[Run], Path | None] | None = None
     memory: Callable[[Run], Memory] | None = None
 
 
 def write_inputs(run: Run) -> None:
-    """Write out the configuration, list the user's own files, and notice stored files that were changed or deleted."""
+    """Write the full configuration, list the user's own files, and notice changed or deleted stored files."""
     write_json(run.path(INPUTS), inputs.listing(run.config))
     run.trajectories.notice_changes()
     run.frames.notice_changes()
@@ -100,10 +101,10 @@ def doctor(run: Run) -> None:
         tried = False
     if doctor.run(run, tried=tried):
         raise PipelineError(
-            "this machine cannot make the run",
+            "this machine cannot perform the run",
             where=run.folder,
-            expected="no line above that begins with `fail`",
-            remedy="do what such lines say at their end, and run again",
+            expected="no check above with the result `fail`",
+            remedy="follow the remedies of the failed checks, and run the command again",
         )
     if not tried:
         machine.record(run, machine.trial().digests)
@@ -118,8 +119,8 @@ def make_plan(run: Run) -> None:
     dropped.refuse_deletion(rows, run)
     for axis, number in plan.shortage(rows, run.config.plan).items():
         print(
-            f"{axis}: {number} of {run.config.plan.episodes[axis]} wanted episodes cannot be planned, as no more "
-            "different draws are left; use more demonstrations or ask for fewer",
+            f"{axis}: {number} of {run.config.plan.episodes[axis]} wanted episodes cannot be planned, because no "
+            "different perturbation is left; use more demonstrations or request fewer episodes",
             file=sys.stderr,
         )
     plan.write(rows, run.plan_file)
@@ -128,9 +129,9 @@ def make_plan(run: Run) -> None:
 
 
 def check_leakage(run: Run) -> None:
-    """Compare every planned perturbation with the benchmark's test tasks, and stop where one overlaps.
+    """Compare every planned perturbation with the benchmark's test tasks, and stop if one overlaps.
 
-    Overlaps on an axis that is configured to keep no clearance are reported only.
+    On an axis that is configured to keep no clearance, overlaps are only reported.
     """
     findings = leakage.check(run.plan, benchmark.load())
     leakage.write(findings, run.path(LEAKAGE))
@@ -142,7 +143,7 @@ def check_leakage(run: Run) -> None:
 
 
 def replay(run: Run) -> None:
-    """Run the physics of every planned trajectory and judge it; needs no GL. Resumes where it was stopped."""
+    """Replay and judge every planned trajectory, without OpenGL; a stopped stage resumes."""
     rows, config = run.plan, run.config
     plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
@@ -158,22 +159,22 @@ def replay(run: Run) -> None:
 
 
 def render(run: Run) -> None:
-    """Render the frames of every kept episode from the stored states. Resumes where it was stopped.
+    """Render the frames of every kept episode from the stored states; a stopped stage resumes.
 
-    If frames are rejected, the reserves that take their place are replayed, as in the stage replay.
+    If frames are rejected, the reserves that replace their episodes are replayed, as in the stage ``replay``.
     """
     print(gl.choose())
     rows, config = run.plan, run.config
     plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
     dropped.refuse_deletion(rows, run)
-    # The configuration may have changed since the plan was made.
+    # The configuration may have changed since the plan was written.
     config.export.refuse_too_few(plan.demonstrations(rows))
     replayed = int(read_json(run.path(REPLAY))["replayed"])
     with run.workers(renders=True) as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
         rejected: dict[str, str] | None = None
-        # `render_plan` renders reserves that are replayed already. This loop replays those that are not.
+        # `render_plan` renders the reserves that are already replayed. This loop replays the other reserves.
         while True:
             rejected_now = rejections(rows, frames_by_trajectory(run.frames.rows()))
             if rejected_now == rejected:
@@ -185,8 +186,8 @@ def render(run: Run) -> None:
     run.trajectories.keep(verdicts)
     further = len(verdicts) - replayed
     if further:
-        print(f"replayed {further} reserves, as frames before them were rejected")
-    print(f"{len(rendered)} files of frames are in {run.frames.root}")
+        print(f"replayed {further} reserves, which replace episodes with rejected frames")
+    print(f"{len(rendered)} files of frames are stored in {run.frames.root}")
 
 
 def _export(group: str) -> Stage:
@@ -201,10 +202,12 @@ def _export(group: str) -> Stage:
         export.list_records(run)
         say_stale(group, run)
 
-    def whole(run: Run) -> bool:
-        """Return whether the finished datasets have all their files, unchanged, and their records are listed."""
+    def changed_file(run: Run) -> Path | None:
+        """Return a changed or missing file of the finished datasets, or their list of records if it is missing."""
+        if not run.path(DATASETS).exists():
+            return run.path(DATASETS)
         datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
-        return run.path(DATASETS).exists() and all(export.untouched(dataset) for dataset in datasets)
+        return next(filter(None, map(export.changed_file, datasets)), None)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
     settings, files = [*_EXPORT], [*_OUTCOME]
@@ -212,7 +215,7 @@ def _export(group: str) -> Stage:
         # The rewrites of a task depend on the plan's language axis and on the user's own bank.
         settings, files = [*_EXPORT, "plan"], [INPUTS, *_OUTCOME]
     records_of_failures = [f"{FAILURES}/{record}" for record in records]
-    return Stage(write_datasets, settings, files, (*records, *records_of_failures), whole)
+    return Stage(write_datasets, settings, files, (*records, *records_of_failures), changed_file)
 
 
 def write_manifest(run: Run) -> None:
@@ -238,25 +241,25 @@ def validate(run: Run) -> None:
     if finished.validate_memory(run).holds():
         # `push` requires checks that are no older than the checked files.
         file.touch()
-        print(f"nothing has changed since the checks of {file} found nothing off")
+        print(f"nothing has changed since the last checks, which found no errors: see {file}")
         return
     from pipeline.validation.validate import validate
 
     with run.workers(renders=True) as workers:
         report = validate(run, workers)
     write_json(file, report)
-    off = {check: result["findings"] for check, result in report.items() if result["findings"]}
-    if off:
-        first = next(iter(off.values()))[0]
-        numbers = ", ".join(f"{check} {len(findings)}" for check, findings in off.items())
+    errors = {check: result["findings"] for check, result in report.items() if result["findings"]}
+    if errors:
+        first = next(iter(errors.values()))[0]
+        numbers = ", ".join(f"{check} {len(findings)}" for check, findings in errors.items())
         raise PipelineError(
-            f"{first['what']}; findings in all: {numbers}",
+            f"{first['what']}; number of findings of each check: {numbers}",
             where=f"{first['dataset']} {first['episode'] or ''}".strip(),
             expected=first["expected"],
             remedy=f"read {file}, correct the cause, and run `{MAKE_AGAIN}` again",
         )
     finished.validate_memory(run).keep()
-    print(f"{len(report)} checks found nothing off, see {file}")
+    print(f"{len(report)} checks found no errors, see {file}")
 
 
 def write_recipe(run: Run) -> None:
@@ -267,7 +270,7 @@ def write_recipe(run: Run) -> None:
     built = recipe.build(run.manifest_file, run.manifest, export)
     recipe.write(built, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
     file = run.path(FINETUNE) / RECIPE
-    print(f"{file} has the recipe and a command line for each of {', '.join(built['clients'])}")
+    print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
 
 
 def summarize(run: Run) -> None:
@@ -298,11 +301,11 @@ def write_card(run: Run) -> None:
     from pipeline.publish import card
 
     card.write(run)
-    print(f"{run.path(CARD)} has a README.md for each format; `dataset push` uploads it with the data")
+    print(f"wrote {run.path(CARD)}, with a README.md for each format; `dataset push` uploads it with the data")
 
 
 def write_report(run: Run) -> None:
-    """Write one HTML page about the run, with its counts, plots, pictures and videos in it."""
+    """Write one HTML page about the run, which contains its counts, plots, pictures and videos."""
     file = run.report_file
     memory = finished.report_memory(run)
     if not memory.holds():
@@ -310,15 +313,15 @@ def write_report(run: Run) -> None:
 
         write(file, report.page(run, benchmark.load()))
         memory.keep()
-    print(f"{file} ({file.stat().st_size / 1e6:.1f} MB) opens in any browser")
+    print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB), which opens in any browser")
 
 
-def _replays_whole(run: Run) -> bool:
-    return run.trajectories.untouched()
+def _changed_replay(run: Run) -> Path | None:
+    return run.trajectories.changed_file()
 
 
-def _frames_whole(run: Run) -> bool:
-    return run.trajectories.untouched() and run.frames.untouched()
+def _changed_frames(run: Run) -> Path | None:
+    return run.trajectories.changed_file() or run.frames.changed_file()
 
 
 _OUTCOME = (PLAN, TRAJECTORIES_TABLE, FRAMES_TABLE)
@@ -336,14 +339,14 @@ STAGES = {
         ("demos", "replay", "filter"),
         (INPUTS, MACHINE, PLAN, LEAKAGE),
         (REPLAY, TRAJECTORIES_TABLE),
-        _replays_whole,
+        _changed_replay,
     ),
     "render": Stage(
         render,
         ("demos", "replay", "filter", "render", "export"),
         (INPUTS, MACHINE, PLAN, REPLAY),
         (TRAJECTORIES_TABLE, FRAMES_TABLE),
-        _frames_whole,
+        _changed_frames,
     ),
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
     "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
@@ -387,7 +390,7 @@ def perform(name: str, run: Run, title: str = "") -> None:
         return
     print(title or name, flush=True)
     if reason not in (EVERY_TIME, finished.NO_RECORD):
-        print(f"  changed since the last call: {reason}", flush=True)
+        print(f"  reason: {reason}", flush=True)
     refuse_foreign_files(run.folder)
     STAGES[name].work(run)
     after = _memory(name, Run(run.config))
@@ -397,11 +400,12 @@ def perform(name: str, run: Run, title: str = "") -> None:
 
 def why_not(name: str, run: Run) -> str | None:
     """Describe why a stage has to work; `None` if its outputs are up to date."""
-    memory, whole = _memory(name, run), STAGES[name].whole
+    memory, changed_file = _memory(name, run), STAGES[name].changed_file
     reason = EVERY_TIME if memory is None else memory.why_not()
-    if reason is None and whole is not None and not whole(run):
-        return "a stored file is missing or has changed"
-    return reason
+    if reason is not None or changed_file is None:
+        return reason
+    file = changed_file(run)
+    return None if file is None else finished.missing_or_changed(file, run.folder)
 
 
 def _memory(name: str, run: Run) -> Memory | None:

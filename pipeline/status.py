@@ -1,4 +1,7 @@
-"""The state of a run: kept and wanted episodes, stages that would run and why, and the disk. Nothing is changed."""
+"""The state of a run: wanted and kept episodes, stages that would run and the reasons, and the disk.
+
+Nothing is changed.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,17 +39,20 @@ def told(run: Run) -> Iterator[str | Table]:
     yield _counts(config, rows, judged, frames)
     steps = dict(_steps(run, rows, verdicts, frames, rejected))
     if steps:
-        yield "would run:"
+        yield "stages that would run:"
         yield from (f"  {step}: {why}" for step, why in steps.items())
     # Until all episodes are replayed and rendered, undecided candidates count as kept, so nothing is short.
     if not steps.keys() & {"plan", "replay", "render"}:
         missing = counts.shortfalls(_targets(config, rows, judged))
         yield from missing
         if not steps:
-            yield "nothing would run" if missing else "nothing would run: all of this configuration is made"
+            yield "no stage would run" if missing else "no stage would run: all datasets are finished"
     unneeded = dropped.measure(rows, run)
     if unneeded.asks:
-        yield f"no longer needed, and deleted by a run with REMAKE=1, without which it stops: {unneeded}"
+        yield (
+            f"finished work that is no longer needed: {unneeded}. A run stops before it deletes this work, unless "
+            "REMAKE=1 allows it"
+        )
     yield from edits_in_words(run.folder)
     yield _disk(run)
     # Count undecided candidates as kept until they are replayed.
@@ -63,9 +69,9 @@ def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verd
 def _counts(
     config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
 ) -> Table:
-    table = Table("axis", "wanted", "planned", "reach their goal", "rendered", title="episodes")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = Table("axis", title="episodes")
+    for head in ("wanted", "planned", "reach their goal", "rendered"):
+        table.add_column(head, justify="right", no_wrap=True)
     every = []
     for axis in ("clean", *config.plan.episodes):
         of_axis = [row for row in rows if row.axis == axis]
@@ -73,6 +79,7 @@ def _counts(
         planned = sum(row.wanted for row in of_axis)
         wanted, rendered = config.plan.episodes.get(axis, planned), sum(outcome.rendered(row, frames) for row in kept)
         every.append((wanted, planned, len(kept), rendered))
+        # The name of a combination may break after a +.
         table.add_row(axis.replace("+", "+ "), *map(str, every[-1]))
     table.add_section()
     table.add_row("all", *map(str, map(sum, zip(*every, strict=True))))
@@ -87,24 +94,24 @@ def _steps(
     rejected: Mapping[str, str],
 ) -> Iterator[tuple[str, str]]:
     if not rows:
-        yield "plan", "there is no plan yet"
+        yield "plan", "no plan exists yet"
         return
     config = run.config
     why_planned = stages.why_not("plan", run)
     if why_planned is not None:
         yield "plan", why_planned
-    made_anew = outdated(rows, run.trajectories, run.frames)
+    generated_again = outdated(rows, run.trajectories, run.frames)
     needed = selection.pending(rows, verdicts, rejected)
     if needed:
-        yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
+        yield "replay", f"{len(needed)} trajectories are missing" + _of(generated_again, "trajectories")
     judged = selection.select(rows, verdicts, rejected)
     to_render = [row for row in rows if judged[row.episode_id].kept]
     to_render += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
     missing = [row for row in to_render if not outcome.rendered(row, frames)]
     if missing:
-        yield "render", f"the frames of {len(missing)} episodes are not there" + _of(made_anew, "files of frames")
+        yield "render", f"the frames of {len(missing)} episodes are missing" + _of(generated_again, "files of frames")
     if needed or missing or why_planned is not None:
-        yield "exports and all that follows", "their episodes are not all there" if needed or missing else "a new plan"
+        yield "exports and later stages", "some of their episodes are missing" if needed or missing else "a new plan"
         return
     yield from _follow(run)
 
@@ -115,7 +122,7 @@ def _follow(run: Run) -> Iterator[tuple[str, str]]:
     stale = list(_stale_datasets(run))
     yield from stale
     if stale:
-        yield "manifest and all that follows", "the datasets are not those"
+        yield "manifest and later stages", "the datasets would change"
         return
     yield from _outdated(run, ("manifest", "recipe", "card"))
     for memory in (finished.validate_memory(run), finished.summary_memory(run), finished.report_memory(run)):
@@ -136,19 +143,20 @@ def _outdated(run: Run, names: Sequence[str]) -> Iterator[tuple[str, str]]:
 def _stale_datasets(run: Run) -> Iterator[tuple[str, str]]:
     for dataset in (*run.formats, *(run.failure_formats if run.outcome.missed else ())):
         episodes = export.episodes_of(dataset, run)
-        if not export.untouched(dataset):
-            why = "there is no dataset, or files of it have changed"
+        changed_file = export.changed_file(dataset)
+        if changed_file is not None:
+            why = finished.missing_or_changed(changed_file, run.folder)
         elif not dataset.record().matches(export.compute_basis(dataset, episodes)):
-            reason = next(iter(export.outdated(dataset, episodes)), "files of other episodes or options")
+            reason = next(iter(export.outdated(dataset, episodes)), "files of other episodes or with other options")
             why = f"the dataset has {reason}"
         else:
             continue
         yield f"export_{dataset.group}", f"{dataset.title}: {why}"
 
 
-def _of(made_anew: Counter[str], what: str) -> str:
-    reasons = "; ".join(f"{number} {reason}" for reason, number in made_anew.items() if reason.startswith(what))
-    return f" (would be made anew: {reasons})" if reasons else ""
+def _of(generated_again: Counter[str], kind: str) -> str:
+    reasons = "; ".join(f"{number} {reason}" for reason, number in generated_again.items() if reason.startswith(kind))
+    return f" (would be generated again: {reasons})" if reasons else ""
 
 
 def _time_left(
@@ -176,7 +184,7 @@ def _time_left(
 def not_made(
     needed: Sequence[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
 ) -> dict[str, float]:
-    """Return the shares in [0, 1] of the trajectories and streams that ``replay`` and ``render`` still have to do.
+    """Return the shares in [0, 1] of the trajectories and streams that ``replay`` and ``render`` have yet to generate.
 
     Trajectories and streams that several rows share count once.
     """
@@ -198,5 +206,5 @@ def _disk(run: Run) -> str:
     listed = ", ".join(f"{part} {size_mb / 1e3:.2f}" for part, size_mb in used.items() if size_mb >= 10)
     return (
         f"disk: {sum(used.values()) / 1e3:.2f} GB used{f' ({listed})' if listed else ''}, about "
-        f"{sum(needed_mb(run.config).values()) / 1e3:.1f} GB when all is made, {free_gb(run.folder):.1f} GB free"
+        f"{sum(needed_mb(run.config).values()) / 1e3:.1f} GB when finished, {free_gb(run.folder):.1f} GB free"
     )

@@ -1,4 +1,4 @@
-"""Loaders for YAML that a person wrote: plain values, and each key of a mapping once."""
+"""Loaders for YAML that a person wrote: plain values, and no repeated key in a mapping."""
 
 import re
 from itertools import chain
@@ -19,7 +19,7 @@ class _EachKeyOnce(yaml.constructor.SafeConstructor):
             for place, (key, _) in enumerate(pairs):
                 if key.value in names[:place]:
                     raise yaml.constructor.ConstructorError(
-                        None, None, f"the key {key.value!r} is given twice", key.start_mark
+                        None, None, f"the key {key.value!r} is repeated", key.start_mark
                     )
             parts = current.value if isinstance(current, yaml.SequenceNode) else list(chain.from_iterable(pairs))
             nodes += [part for part in dict.fromkeys(parts) if part not in visited]
@@ -28,7 +28,7 @@ class _EachKeyOnce(yaml.constructor.SafeConstructor):
 
 
 class StrictLoader(_EachKeyOnce, yaml.SafeLoader):
-    """Loader of a person's YAML: plain values, and each key of a mapping once.
+    """Loader of a person's YAML: plain values, and no repeated key in a mapping.
 
     Unlike YAML 1.1, ``yes``, ``off``, ``0123`` (octal 83) and ``1:30`` (90 in base 60) are text.
     """
@@ -50,4 +50,4 @@ for _tag, _pattern, _first in (
 
 
 class FastStrictLoader(_EachKeyOnce, yaml.CSafeLoader):
-    """Loader in C for long files, each key once too; thousands of nested levels end the process."""
+    """Loader in C for long files, which rejects repeated keys too. Thousands of nested levels end the process."""

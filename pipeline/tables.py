@@ -57,21 +57,26 @@ def read_table(path: Path, columns: Collection[str], remedy: str) -> pa.Table:
         PipelineError: when the table is missing or damaged, or lacks columns.
     """
     if not path.is_file():
-        raise PipelineError("not there", where=path, remedy=remedy)
+        raise PipelineError("the file is missing", where=path, remedy=remedy)
     try:
-        # Without threads, the same one of several errors is always reported. pq.read_table would import pandas.
+        # Without threads, the reported error is always the same. pq.read_table would import pandas.
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read(use_threads=False)
         if (table.schema.metadata or {}).get(SEAL) != _digest(table):
-            raise ValueError("it does not hold what was written")
+            raise ValueError("its values differ from its checksum")
     except MemoryError:
         raise
     except (OSError, ValueError, TypeError, LookupError, RuntimeError, pa.ArrowException) as error:
-        raise PipelineError(f"damaged ({error})", where=path, remedy=f"move it away, and {remedy}") from error
+        raise PipelineError(
+            f"the file is damaged ({error})", where=path, remedy=f"move it to another place, and {remedy}"
+        ) from error
     lacking = sorted(set(columns) - set(table.column_names))
     if lacking:
         raise PipelineError(
-            f"lacks the columns {', '.join(lacking)}", where=path, expected="a file of this version", remedy=remedy
+            f"the file lacks the columns {', '.join(lacking)}",
+            where=path,
+            expected="a file of this version",
+            remedy=remedy,
         )
     return table
 

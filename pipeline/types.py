@@ -49,7 +49,7 @@ class Frozen(BaseModel):
 
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
-"""A number of files. Its limit is above any use: larger numbers would fill memory before any message appears."""
+"""A number of files or episodes. Numbers above the limit would fill the memory before any message appears."""
 
 LONGEST_NAME = 60
 """Largest length of a name in paths. A path may join several names; file systems limit a name to 255 bytes."""
@@ -202,18 +202,22 @@ class Verdict:
 class Quality:
     """Quality measures of a trajectory's motion (``physics/quality.py``): columns of the manifest, with their meanings.
 
-    In these meanings, the goal does not name "another object". Such an object also does not stand on or in anything
-    that the goal moves.
+    In these meanings, "another object" is not named by the goal. It also does not stand on or in anything that the goal
+    moves.
     """
 
-    non_target_moved_m: Annotated[float, "largest displacement of another object at any step, from the first look"]
+    non_target_moved_m: Annotated[
+        float, "largest displacement of another object at any step, from the first observation"
+    ]
     non_target_left_m: Annotated[float, "largest displacement of another object after the last step"]
-    touched_steps: Annotated[int, "steps after which the robot touches something else than the things of the goal"]
+    touched_steps: Annotated[int, "number of steps after which the robot touches a thing that is not part of the goal"]
     path_m: Annotated[float, "length of the end effector's path"]
     jerk_rms_m_s3: Annotated[float, "root mean square of the end effector's jerk, by third differences at 20 Hz"]
     idle_share: Annotated[float, "share of steps in which hand and fingers move less than 0.5 mm and 0.25 degrees"]
-    joint_margin_rad: Annotated[float, "smallest distance of a joint of the arm to its limit; below 0 where it yields"]
-    lag_m: Annotated[float, "largest distance between where an action asks the hand to be and where the step takes it"]
+    joint_margin_rad: Annotated[
+        float, "smallest distance of a joint of the arm to its limit; below 0 if the joint exceeds the limit"
+    ]
+    lag_m: Annotated[float, "largest distance between the commanded and the reached position of the hand at any step"]
 
 
 @dataclass(frozen=True)

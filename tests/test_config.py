@@ -1,17 +1,19 @@
 """The configuration: what is not understood is refused, by file, field and remedy."""
 
+import inspect
 import json
 import math
 import re
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jsonschema
 import pytest
 import yaml
 from conftest import REPOSITORY
+from pydantic import BaseModel
 
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.language import LanguageAxis
@@ -62,10 +64,31 @@ def test_the_page_of_fields_is_that_of_the_code() -> None:
     assert re.findall(r"^\|.*\| *\|$", page, re.MULTILINE) == ["| field | values | default | |"] * page.count("<!-- f")
 
 
+def models_in(annotation: Any) -> set[type[BaseModel]]:
+    """Find the models that a type annotation contains, and the models in their fields."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        found = {annotation}
+        for field in annotation.model_fields.values():
+            found |= models_in(field.annotation)
+        return found
+    return set().union(*(models_in(part) for part in get_args(annotation)))
+
+
+@pytest.mark.parametrize("model", sorted(models_in(Config), key=lambda model: model.__name__))
+def test_every_field_is_described(model: type[BaseModel]) -> None:
+    """The descriptions are a table of the documentation: one entry for each field, in whole sentences."""
+    entries = inspect.getdoc(model).partition("Attributes:\n")[2]  # type: ignore[union-attr]
+    described = dict(re.findall(r"^    (\w+): (.*(?:\n     .*)*)", entries, re.MULTILINE))
+    assert list(described) == [name for name in model.model_fields if name in described], "in the order of the fields"
+    assert set(described) == set(model.model_fields)
+    for name, text in described.items():
+        assert re.fullmatch(r"(?s)([A-Z0-9]|``).*\.", text), name
+
+
 @pytest.mark.parametrize(
     ("value", "keys", "message"),
     [
-        (1, ("render", "jpg_quality"), "render.jpg_quality: there is no such field; did you mean jpeg_quality?"),
+        (1, ("render", "jpg_quality"), "render.jpg_quality: unknown field; did you mean jpeg_quality?"),
         (30, ("render", "jpeg_quality"), "render.jpeg_quality: expected at least 50, got 30"),
         ("closed_loop", ("replay", "mode"), "replay.mode: expected 'open_loop', 'tracked' or 'auto', got"),
         ({"camera": 0, "noise": 1, "language": 1}, ("plan", "episodes"), "plan.episodes.camera"),
@@ -76,7 +99,7 @@ def test_the_page_of_fields_is_that_of_the_code() -> None:
         (
             {"camera+light": 4, "light+camera": 2},
             ("plan", "episodes"),
-            "'camera+light' is asked for twice, in two orders",
+            "'camera+light' is listed twice, in two orders",
         ),
         (
             {
@@ -93,13 +116,13 @@ def test_the_page_of_fields_is_that_of_the_code() -> None:
         ({"robot": {"norm_rad": [0.1, 0.2, 0.3, 0.4, math.inf]}}, ("plan", "axes"), "finite number"),
         (2**63, ("plan", "seed"), "plan.seed: expected less than"),
         ({"camera": 10**9}, ("plan", "episodes"), "plan.episodes.camera: expected at most 1000000, got 1000000000"),
-        ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: there is no such field; the fields are layout, pose"),
-        ({"source": "starter", "root": "/tmp"}, ("demos",), "root goes with source: hdf5"),
-        ({"source": "hdf5"}, ("demos",), "root goes with source: hdf5"),
+        ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: unknown field; the fields are layout, pose"),
+        ({"source": "starter", "root": "/tmp"}, ("demos",), "source: hdf5 and root require each other"),
+        ({"source": "hdf5"}, ("demos",), "source: hdf5 and root require each other"),
         ({"tasks": ["libero_goal/put_the_bowl_on_the_plat"]}, ("demos",), "libero_goal/put_the_bowl_on_the_plate"),
-        ({"tasks": ["libero_90/*"]}, ("demos",), "plan.axes.language: no rewrites of 90 tasks"),
+        ({"tasks": ["libero_90/*"]}, ("demos",), "plan.axes.language: 90 tasks have no rewrites"),
         ({"rlds": None, "lerobot": None}, ("export",), "no format is left, expected one of rlds, lerobot"),
-        ({"axis": ["wind"]}, ("export", "where"), "export.where.axis: the run has no 'wind', expected of ["),
+        ({"axis": ["wind"]}, ("export", "where"), "export.where.axis: the run has no 'wind', expected values ["),
         ({"component": ["target", "sky"]}, ("export", "where"), "export.where.component: the run has no 'sky'"),
         ({"level": [6]}, ("export", "where"), "export.where.level.0: expected at most 5, got 6"),
         ({"level": []}, ("export", "where"), "export.where.level"),
@@ -108,7 +131,7 @@ def test_the_page_of_fields_is_that_of_the_code() -> None:
         ("carrier pigeon", ("compute",), "compute"),
         ("my_set", ("export", "rlds", "name"), "export.rlds.name"),
         ("libero_aloha", ("export", "rlds", "name"), "a name with libero and without aloha in it"),
-        (4, ("export", "lerobot", "parts"), "export.lerobot.parts: there is no such field"),
+        (4, ("export", "lerobot", "parts"), "export.lerobot.parts: unknown field"),
         (0.6, ("export", "rlds", "validation"), "export.rlds.validation: expected at most 0.5, got 0.6"),
         (1e-320, ("export", "lerobot", "validation"), "export.lerobot.validation"),
         ({"levels": 1}, ("plan", "axes", "camera"), "plan.axes.camera.levels: expected a list, such as [1, 2], got 1"),
@@ -117,7 +140,7 @@ def test_the_page_of_fields_is_that_of_the_code() -> None:
         ("high", ("render", "jpeg_quality"), "render.jpeg_quality: expected a whole number, got 'high'"),
         ("My run", ("name",), "name: expected a lower-case letter, then lower-case letters, digits or underscores"),
         ({}, ("export", "lerobot_v21"), "export.lerobot_v21.convention: this field is required"),
-        (3, ("plan", "sed"), "plan.sed: there is no such field; did you mean seed?"),
+        (3, ("plan", "sed"), "plan.sed: unknown field; did you mean seed?"),
         ({"background": {"colour_scale": [0.2, 0.4, 0.6, 0.8, 2.0]}}, ("plan", "axes"), "colour_scale.4"),
     ],
 )
@@ -187,7 +210,7 @@ def test_no_run_is_stored_among_demonstrations(
     file = tmp_path / "run.yaml"
     fields = {"name": "run", "folder": str(tmp_path / "elsewhere" / ".." / folder), "demos": demos, "plan": plan}
     file.write_text(yaml.safe_dump(fields))
-    with pytest.raises(PipelineError, match=r"is, is in or contains demos\.root"):
+    with pytest.raises(PipelineError, match=r"overlaps with demos\.root"):
         load(file)
     file.write_text(yaml.safe_dump(fields | {"folder": "data"}))
     load(file)
@@ -222,7 +245,7 @@ def test_missing_and_broken_files(tmp_path: Path) -> None:
 )
 def test_a_key_that_is_given_twice_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "dup.yaml").write_text(text)
-    with pytest.raises(PipelineError, match=r"dup\.yaml.*not valid YAML: the key '(plan|camera)' is given twice"):
+    with pytest.raises(PipelineError, match=r"dup\.yaml.*not valid YAML: the key '(plan|camera)' is repeated"):
         load(tmp_path / "dup.yaml")
 
 
@@ -254,8 +277,8 @@ def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("replay", "message"),
     [
-        ("noops: keep", r"goes with replay\.noops: drop"),
-        ("mode: open_loop", r"with replay\.mode: auto or tracked"),
+        ("noops: keep", r"disturbance requires replay\.noops: drop"),
+        ("mode: open_loop", r"disturbance requires replay\.mode: auto or tracked"),
     ],
 )
 def test_pushes_go_with_dropped_no_ops_and_tracking(replay: str, message: str, tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_an_edit_is_named_and_stays_until_it_is_allowed(
     before = states(folder)
     with pytest.raises(PipelineError) as caught:
         generate(folder, one="another", two="another")
-    for words in (EDITS[edit], "publish:", "a copy", "REMAKE=1"):
+    for words in (EDITS[edit], "publish:", "copy the files", "REMAKE=1"):
         assert words in str(caught.value)
     assert states(folder) == before
     assert [line.count(EDITS[edit]) for line in edits_in_words(folder.parent)] == [1]
@@ -121,7 +121,7 @@ def test_only_files_as_recorded_are_handed_out(folder: Path, edit: Callable[[Pat
     edit(folder)
     with pytest.raises(PipelineError) as caught:
         unchanged(folder)
-    assert EDITS[edit] in str(caught.value) or ".generated.json: not there" in str(caught.value)
+    assert EDITS[edit] in str(caught.value) or ".generated.json: the file is missing" in str(caught.value)
 
 
 KILLED = """

@@ -97,7 +97,7 @@ def test_falls_back_to_osmesa_and_says_why(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_nothing_that_renders_names_the_packages(devices: dict[tuple[str, str | None], str]) -> None:
-    with pytest.raises(PipelineError, match=r"no OpenGL renders here.*egl fails.*osmesa fails") as caught:
+    with pytest.raises(PipelineError, match=r"no OpenGL back end renders here.*egl fails.*osmesa fails") as caught:
         choose()
     assert "libegl1" in str(caught.value.remedy)
     assert "libosmesa6" in str(caught.value.remedy)
@@ -173,7 +173,10 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 def test_an_idle_gpu_is_said_aloud(machine: Path, devices: dict[tuple[str, str | None], str]) -> None:
     devices["egl", None] = CPU
-    assert "slower than the GPU that is there: its driver does not answer; see that nvidia-smi" in str(choose())
+    assert (
+        "slower than this machine's GPU, which does not render: the GPU's driver does not answer; check that nvidia-smi"
+        in str(choose())
+    )
 
 
 def test_no_gpu_is_none_that_idles(machine: Path) -> None:
@@ -185,7 +188,7 @@ def test_a_gpu_without_its_node(machine: Path) -> None:
     (machine / "nvidia0").unlink()
     (machine / "gpus").mkdir()
     what, remedy = gl.idle_gpu() or ("", "")
-    assert what.endswith(f"there is no {machine}/nvidia0")
+    assert what.endswith(f"{machine}/nvidia0 is missing")
     assert "nvidia-modprobe" in remedy
     assert "--nv" in remedy
 
@@ -213,7 +216,7 @@ def test_a_gpu_that_no_vendor_file_names(machine: Path, monkeypatch: pytest.Monk
     # What it says to write is such a file.
     (machine / "vendors" / "10_nvidia.json").write_text(remedy.split("'")[1])
     monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
-    assert (gl.idle_gpu() or ("", ""))[0] == "its driver does not answer"
+    assert (gl.idle_gpu() or ("", ""))[0] == "the GPU's driver does not answer"
 
 
 @pytest.mark.parametrize("nvidia", [False, True])
@@ -224,7 +227,7 @@ def test_a_render_node_that_the_user_may_not_open(machine: Path, nvidia: bool) -
     node.unlink()
     node.symlink_to("nothing")  # which root may not open either
     what, remedy = gl.idle_gpu() or ("", "")
-    assert what == f"this user may not open {node}"
+    assert what == f"this user has no permission to open {node}"
     assert "usermod -aG" in remedy
 
 

@@ -42,7 +42,7 @@ def test_a_home_that_cannot_be_written_is_named_with_the_variable(tmp_path: Path
     for command in (loop, doctor):
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 1
-        assert "Numba has no folder to keep compiled loops in" in done.stderr
+        assert "Numba has no folder for compiled loops" in done.stderr
         assert "export NUMBA_CACHE_DIR=" in done.stderr
         assert command is loop or "Traceback" not in done.stderr
     environment |= {"NUMBA_CACHE_LOCATOR_CLASSES": "", "NUMBA_CACHE_DIR": str(tmp_path / "numba")}

@@ -36,7 +36,7 @@ def test_a_libero_clone_is_an_error_with_its_path_and_the_variable(command: tupl
     done = started(*command, path=clone)
     assert done.returncode == 1
     assert f"error: PYTHONPATH={clone}: libero is imported from {clone / 'libero'}" in done.stderr
-    assert f"take {clone} out of the variable PYTHONPATH" in done.stderr
+    assert f"remove {clone} from the variable PYTHONPATH" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -21,15 +21,15 @@ def test_the_same_basis_matches_also_after_a_round_through_json_and_in_another_o
 @pytest.mark.parametrize(
     ("requested", "made_with", "reason"),
     [
-        ({**REQUESTED, "files": {"plan.parquet": "dd", "inputs.json": "bb"}}, MADE_WITH, "other plan.parquet"),
-        ({**REQUESTED, "files": {"plan.parquet": "aa"}}, MADE_WITH, "other inputs.json"),
-        ({**REQUESTED, "settings": {"seed": 2, "episodes": {"camera": 5}}}, MADE_WITH, "other seed, episodes.camera"),
+        ({**REQUESTED, "files": {"plan.parquet": "dd", "inputs.json": "bb"}}, MADE_WITH, "changed plan.parquet"),
+        ({**REQUESTED, "files": {"plan.parquet": "aa"}}, MADE_WITH, "changed inputs.json"),
+        ({**REQUESTED, "settings": {"seed": 2, "episodes": {"camera": 5}}}, MADE_WITH, "changed seed, episodes.camera"),
         (
             {"settings": 1, "files": {"a": "1", "b": "2"}},
             MADE_WITH,
-            "other settings, plan.parquet, inputs.json and 2 more",
+            "changed settings, plan.parquet, inputs.json and 2 more",
         ),
-        ({**REQUESTED, "optional": None}, MADE_WITH, "other optional"),
+        ({**REQUESTED, "optional": None}, MADE_WITH, "changed optional"),
         (REQUESTED, {**MADE_WITH, "numpy": "2.3.0"}, "numpy 2.2.6, here 2.3.0"),
         (REQUESTED, {**MADE_WITH, "mujoco": "3.2.7"}, "mujoco none, here 3.2.7"),
     ],

@@ -100,5 +100,5 @@ def test_preview_says_what_to_install(tmp_path: Path, machine: dict[str, str]) -
     )
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert "error: no OpenGL renders here" in done.stderr
+    assert "error: no OpenGL back end renders here" in done.stderr
     assert gl.REMEDY in done.stderr

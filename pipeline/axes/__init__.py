@@ -33,6 +33,17 @@ class Axes(Frozen):
 
     They are listed in the order in which their perturbations apply, deepest layer first. Objects are added first, at
     free places of a demonstration's scene. Then the target and the arm move, and are rejected if they touch an object.
+
+    Attributes:
+        layout: Objects that are added to the scene.
+        pose: Displaced and turned objects of the scene.
+        robot: Posture in which the arm starts, or to which the controller pulls it.
+        disturbance: Pushes on the hand during the episode.
+        camera: Pose of the agent view's camera.
+        light: Colour, direction, gloss and shadows of the lamps.
+        background: Materials of the room and of the working surface.
+        noise: Corruptions of the frames.
+        language: Rewrites of the instruction.
     """
 
     layout: LayoutAxis | None = None

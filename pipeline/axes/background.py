@@ -148,15 +148,18 @@ class BackgroundAxis(Axis):
     """Components and texture sources to sample from.
 
     Attributes:
-        components: which of them, each as often as the other.
-        sources: where textures come from. ``metaworld`` and ``gymnasium-robotics`` are wheels that pip downloads
-            (63 MB) when a plan first draws from them; the others are there.
-        own_colours: share of perturbations that show all their textures in their own colours, as all test tasks do.
-            Such a perturbation has level 5. There is none if ``levels`` lacks 5.
-        map_share: how often such a draw has a data map on the working surface, as 751 of LIBERO-Plus's 1,076
-            background tests do, where ``sources`` name ``procedural``.
-        image_share: how often an image is drawn rather than a procedural colour map, of which there are many more.
-        colour_scale: for each level, how much of the new texture's own average colour the other perturbations show.
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        components: Components to sample, each entry with equal probability; both by default. ``theme`` covers walls,
+            floor and working surface, ``surface`` only the working surface.
+        sources: Sources of textures; by default the three that setup installs: ``libero``, ``robosuite`` and
+            ``procedural``. pip downloads ``metaworld`` and ``gymnasium-robotics`` (63 MB) when a plan first uses them.
+        own_colours: Share of perturbations that show all textures in their own colours, as all test tasks do; 0.5 by
+            default. Such a perturbation has level 5, and occurs only if ``levels`` contains 5.
+        map_share: Share of the perturbations in own colours with a data map on the working surface, if ``sources``
+            contains ``procedural``; 0.7 by default, as in 751 of LIBERO-Plus's 1,076 background tests.
+        image_share: Share of the other textures that are images instead of procedural colour maps; 0.3 by default.
+        colour_scale: For each level, the share of the new texture's own average colour in the shown average colour.
+            At 0 a texture has the average colour of the replaced one. Perturbations in own colours ignore the field.
     """
 
     draws: ClassVar = (BackgroundPerturbation,)

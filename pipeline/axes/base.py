@@ -173,7 +173,7 @@ class Axis(Frozen):
         audited: part of an unlabelled data set that shows the perturbations of the axis.
         not_held_out: reason why evaluations have no held-out perturbations of this axis; empty if they have some.
         former_fields: former name of a field to its name; configurations may use either.
-        levels: strengths to sample, each with equal probability.
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
     """
 
     draws: ClassVar[tuple[type[Perturbation], ...]]

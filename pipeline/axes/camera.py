@@ -193,13 +193,23 @@ def _both_ways(low: float, high: float) -> Angles:
 
 
 class DistanceRange(Frozen):
-    """The test set's scales are 1.15 and 1.19 to 2.00."""
+    """The test set's scales are 1.15 and 1.19 to 2.00.
+
+    Attributes:
+        distance_scale: For each level, intervals of the multiple of the distance to the orbit centre.
+    """
 
     distance_scale: ByLevel[Scales] = (((1.08, 1.2),), ((1.2, 1.4),), ((1.4, 1.6),), ((1.6, 1.8),), ((1.8, 2.0),))
 
 
 class SphericalRange(Frozen):
-    """The test set's azimuths are whole degrees in [-75, 75], its elevations 0 and 15. The azimuth sets the level."""
+    """The test set's azimuths are whole degrees in [-75, 75], its elevations 0 and 15. The azimuth sets the level.
+
+    Attributes:
+        azimuth_deg: For each level, intervals of the counter-clockwise turn about the world's z axis, in degrees.
+        elevation_deg: Intervals of the rise about the orbit centre at every level, in degrees; positive values lift the
+            camera.
+    """
 
     azimuth_deg: ByLevel[Angles] = (
         ((-15.0, 15.0),),
@@ -212,10 +222,13 @@ class SphericalRange(Frozen):
 
 
 class OrientationRange(Frozen):
-    """The test set turns by 2, 4, 6, 8 or 10 degrees about both axes: each level is about one of these.
+    """Ranges of the component ``orientation``.
+
+    The test set turns cameras by 2, 4, 6, 8 or 10 degrees about both axes. Each level has one of these in its middle.
 
     Attributes:
-        turn_deg: yaw or pitch, each as often as the other; the other one is at most as large, either way.
+        turn_deg: For each level, intervals of the larger turn in place, in degrees. It is yaw or pitch with equal
+            probability, and the other turn has at most its size, in either direction.
     """
 
     turn_deg: ByLevel[Angles] = (
@@ -236,11 +249,12 @@ class AsideRange(Frozen):
     A test camera changes its distance, its place on the sphere or its turn in place, and leaves the other two alone.
 
     Attributes:
-        elevation_deg: to either side of the test set's elevations, 0 and 15.
-        distance_scale: to either side of the nominal distance, which all test cameras but the dollies keep. A smaller
-            turn than the clearance at one of the dollies' distances is sampled again.
-        turn_deg: angle of a turn in place, in any direction. A camera that moved around the scene turns by a yaw.
-            Its pitch is about the world's y axis and would roll the camera, as in no test task.
+        elevation_deg: Intervals of the elevation in degrees; by default on both sides of the test set's elevations, 0
+            and 15 degrees.
+        distance_scale: Intervals of the multiple of the distance; by default on both sides of the nominal distance,
+            which most test cameras keep. A camera that still comes too close to a test camera is sampled again.
+        turn_deg: Intervals of the turn in place in degrees, in any direction. A camera that moved around the scene only
+            turns by a yaw, as its pitch would roll it like no test camera.
     """
 
     elevation_deg: Angles = ((-8.0, -5.1), (5.1, 9.9))
@@ -293,13 +307,17 @@ class CameraAxis(Axis):
     inspected in all five arenas.
 
     Attributes:
-        components: which of them, each as often as the others.
-        clear_by: what keeps the cameras of the four tested suites at their clearance from the test cameras. No value
-            leaves a configured range, and cameras of other suites have no test cameras to keep away from.
-            ``second_change`` changes another one of ``components`` as well, within its ranges. ``resample`` only
-            samples again, which needs ranges that the test cameras leave free. ``off`` keeps no clearance:
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        components: Components to sample, each entry with equal probability: ``distance``, ``spherical`` (moves the
+            camera around the scene) and ``orientation`` (turns it in place); all three by default.
+        distance: Ranges of the component ``distance``.
+        spherical: Ranges of the component ``spherical``.
+        orientation: Ranges of the component ``orientation``.
+        clear_by: Method that keeps the cameras of the four tested suites at their clearance from the test cameras.
+            ``second_change``, the default, also changes a second one of ``components``, within its ranges. ``resample``
+            only samples again, and needs ranges that no test camera occupies. ``off`` keeps no clearance:
             ``leakage.json`` counts the overlaps, and the run continues.
-        aside: ranges of the second change, as far as they are in the ranges of its component.
+        aside: Ranges of the second change, limited to the ranges of its component.
     """
 
     draws: ClassVar = (CameraPerturbation,)

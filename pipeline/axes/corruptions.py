@@ -41,6 +41,10 @@ class Motion(Frozen):
 
     ``out(p) = sum_i w_i in(p + round(i u))`` for i = 0 .. 2 ``radius_px``, w_i ~ exp(-i^2 / 2 sigma^2), u the unit
     vector (cos, sin) of the angle in (x right, y down), halves rounded down, edges repeated.
+
+    Attributes:
+        radius_px: Half of the length of the trail, in pixels.
+        sigma_px: Standard deviation of the trail's weights, in pixels.
     """
 
     component: ClassVar[Component] = "motion"
@@ -65,7 +69,11 @@ class Motion(Frozen):
 
 
 class Gaussian(Frozen):
-    """Defocus as a Gaussian blur; scikit-image's ``gaussian`` with its defaults."""
+    """Defocus as a Gaussian blur; scikit-image's ``gaussian`` with its defaults.
+
+    Attributes:
+        sigma_px: Standard deviation of the blur, in pixels.
+    """
 
     component: ClassVar[Component] = "gaussian_blur"
     strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
@@ -106,6 +114,10 @@ class Zoom(Frozen):
 
     The benchmark spaces them by ``np.arange``. The last digit counts: at a scale of 1.35 or 1.5 it decides whether 256
     pixels become 256 or 257 (``_magnified``), and with them every value.
+
+    Attributes:
+        max_scale: Largest magnification.
+        copies: Number of magnified copies.
     """
 
     component: ClassVar[Component] = "zoom"
@@ -157,7 +169,13 @@ def _diamond_square(jitter: Floats, roughness_decay: float) -> Floats:
 
 
 class Fog(Frozen):
-    """A fractal veil added to the frame x in [0, 1]: ``(x + density veil) m / (m + density)``, m = max(x)."""
+    """A fractal veil added to the frame x in [0, 1]: ``(x + density veil) m / (m + density)``, m = max(x).
+
+    Attributes:
+        density: Weight of the veil; the frame has the weight 1.
+        roughness_decay: Factor whose square divides the veil's random part each time its structures halve in size.
+            Smaller values give a rougher veil.
+    """
 
     component: ClassVar[Component] = "fog"
     strength: ClassVar[tuple[str, float]] = ("density", 0)
@@ -192,6 +210,11 @@ class Glass(Frozen):
     """Frosted glass: blur, scatter pixels by -delta .. delta - 1 in each direction, blur again.
 
     ImageNet-C intends to swap pixels, but its assignment between NumPy views copies one over the other, as here.
+
+    Attributes:
+        sigma_px: Standard deviation of both blurs, in pixels.
+        delta_px: Largest displacement of a pixel in each direction, in pixels.
+        passes: Number of times that the pixels are scattered.
     """
 
     component: ClassVar[Component] = "glass"

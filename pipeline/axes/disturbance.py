@@ -106,14 +106,18 @@ class DisturbancePerturbation(PhysicsPerturbation):
 
 
 class DisturbanceAxis(Axis):
-    """Pushes in all directions within 30 degrees of the horizontal plane, with equal chance.
+    """Pushes in all directions within 30 degrees of the horizontal plane, with equal probability.
 
     Attributes:
-        impulse_n_s: force times duration at each level. The defaults displace the hand by about 1 to 5 cm.
-        steps: control steps that a push takes, 0.1 to 0.4 s by default.
-        first_step: executed actions before it; each of the stretches is drawn as often as the others.
-        away_steps: control steps between a push and where the gripper opens or closes, in the demonstration and in the
-            replay, which waits for the hand; at 0 it may come right before or after.
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        impulse_n_s: Impulse of a push at each level, in N s: force times duration. The defaults displace the hand by
+            about 1 to 5 cm.
+        steps: Intervals of the duration in control steps, each with equal probability; by default 2 to 8 steps, which
+            are 0.1 to 0.4 s.
+        first_step: Intervals of the number of executed actions before the push, each with equal probability; by default
+            5 to 18 and 58 to 66.
+        away_steps: Least number of control steps between a push and a change of the gripper, in the demonstration and
+            in the replay; 5 by default. At 0 the gripper may change directly before or after the push.
     """
 
     draws: ClassVar = (DisturbancePerturbation,)

@@ -78,8 +78,11 @@ class LanguageAxis(Axis):
     """Rewrites from the bank: all rewrites of the chosen levels, each equally often.
 
     Attributes:
-        components: the classes drawn from.
-        bank: a further bank, such as the command ``rewrite`` makes; its rewrites join those that are shipped.
+        levels: Levels of the rewrites to use, 1 (close to LIBERO's wording) to 5; all five by default. Repeated entries
+            have no effect.
+        components: Classes of the rewrites to use; all of them by default.
+        bank: File of further rewrites, such as the command ``rewrite`` writes, which extends the shipped bank; none by
+            default.
     """
 
     draws: ClassVar = (LanguagePerturbation,)

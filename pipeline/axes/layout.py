@@ -124,10 +124,11 @@ class LayoutAxis(Axis):
     repeats its 13 models as often: in 6, 21, 42 and 60 % of its scenes with 2, 3, 4 and 5 objects.
 
     Attributes:
-        sources: ``libero`` and ``robosuite`` are installed; ``sweethome3d`` (fetched by apt-get, 120 MB) and folders of
-            the user's are converted when a plan first draws from them.
-        area_m2: the most that the objects take up together, each of them at most its share: the more objects, the
-            smaller (0.12 m2 is what the broadest object of all takes up).
+        levels: Numbers of added objects to sample, 1 to 5, each entry with equal probability; all five by default.
+        sources: Sources of the objects; by default ``libero`` and ``robosuite``, which setup installs. ``sweethome3d``
+            (fetched by apt-get, 120 MB) and the user's folders are converted when a plan first uses them.
+        area_m2: Largest area of all added objects together, in m2; 0.12 by default, the area of the broadest object.
+            Each object has at most an equal share of it.
     """
 
     draws: ClassVar = (LayoutPerturbation,)

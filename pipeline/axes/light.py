@@ -118,13 +118,15 @@ class LightPerturbation(RenderPerturbation):
 class LightRange(Frozen):
     """Ranges of one level.
 
+    A change of the diffuse light changes either brightness or tint, with equal probability. Surfaces scatter less
+    diffuse light as they become glossier. Otherwise one-pass lighting would cut highlights off at the surface's colour.
+
     Attributes:
-        brightness_scale: multiple of the diffuse light, or else
-        saturation: the diffuse light is tinted so much, in any hue: 0 leaves white, 1 is a pure colour.
-        specular_scale: multiple of the specular light; surfaces get as glossy, and scatter less of the diffuse light.
-            One-pass lighting cuts highlights off at the colour of the surface: without that, none would show.
-        tilt_deg: how far lamps are turned in place.
-        fill_scale: share of the light that reaches into shadows.
+        brightness_scale: Intervals of the multiple of the diffuse light.
+        saturation: Intervals of the saturation of tinted diffuse light, in any hue: 0 is white, 1 is a pure colour.
+        specular_scale: Intervals of the multiple of the specular light. Above 1, surfaces become glossier too.
+        tilt_deg: Intervals of the angle by which lamps are turned in place, in degrees.
+        fill_scale: Intervals of the share of the diffuse light that reaches into shadows.
     """
 
     brightness_scale: Intervals[Multiple]
@@ -148,11 +150,12 @@ class LightAxis(Axis):
     of every component in every arena, for twelve samples each (see docs/axes.md).
 
     Attributes:
-        components: which of them. ``shadows`` turns the lamps, too. ``combined`` changes diffuse light, direction and
-            gloss together, with shadows in half of its draws.
-        combined_share: share of the draws that are ``combined``, where that is one of several components; the others
-            are drawn as often as one another.
-        ranges: one for each level.
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        components: Components to sample; all of them by default. ``shadows`` also turns the lamps. ``combined`` changes
+            diffuse light, direction and gloss together, with shadows in half of its perturbations.
+        combined_share: Share of the perturbations with the component ``combined``, if ``components`` has it and others;
+            0.6 by default. The other components have equal probability.
+        ranges: Ranges of each level, weakest first.
     """
 
     draws: ClassVar = (LightPerturbation,)

@@ -130,10 +130,18 @@ def _grid(effect: type[E], **parameters: ByLevel[float]) -> ByLevel[E]:
 
 
 class NoiseAxis(Axis):
-    """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none.
+    """Parameters of each corruption at each level.
+
+    By default, level k has values between the severities 2k - 1 and 2k of LIBERO-Plus's ten, and never their values.
 
     Attributes:
-        components: which of them, each as often as the others.
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        components: Corruptions to sample, each entry with equal probability; all five by default.
+        motion: Parameters of motion blur at each level.
+        gaussian_blur: Parameters of Gaussian blur at each level.
+        zoom: Parameters of zoom blur at each level.
+        fog: Parameters of fog at each level.
+        glass: Parameters of frosted glass at each level.
     """
 
     draws: ClassVar = (NoisePerturbation,)

@@ -371,11 +371,14 @@ class PoseAxis(Axis):
     move and turn one object, sampled from the objects of the task that they can move.
 
     Attributes:
-        components: moved parts of the scene.
-        benchmark_places: share of the goal suite's scenes in which three objects first get LIBERO-Plus's places, up to
-            35 cm away. Such a scene has level 5, and disks of any level. There is none if ``levels`` lacks 5.
-        step_m: at level k one object is moved by k - 1 to k times this, uniform over the ring.
-        turn_deg: one object is turned by up to this angle to either side, uniform, at every level.
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        components: Components to sample: ``scene`` moves all objects, ``target`` an object that the task moves, and
+            ``receptacle`` an object that receives it; ``scene`` by default.
+        benchmark_places: Share of the goal suite's scenes in which three objects first get LIBERO-Plus's places, up to
+            35 cm away; 1 by default. Such a scene has level 5, and occurs only if ``levels`` contains 5.
+        step_m: Width of a level's ring in m, not for ``scene``: at level k, an object moves by k - 1 to k times this
+            distance; 0.016 by default.
+        turn_deg: Largest turn of an object to either side at every level, in degrees, not for ``scene``; 20 by default.
     """
 
     draws: ClassVar = (PosePerturbation, ScenePerturbation)

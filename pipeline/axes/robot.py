@@ -150,13 +150,16 @@ def measure_start(start: Look, twin: Look, component: str, level: int) -> Iterat
 
 
 class RobotAxis(Axis):
-    """Offsets in all directions with equal chance.
+    """Offsets of the arm's joints in all directions, with equal probability.
 
     Attributes:
-        components: what to sample, each entry equally often. Three of four default entries are the benchmark's.
-        norm_rad: the norm of a controller's posture at each level; the defaults are the benchmark's.
-        initial_norm_rad: the same of initial joints. At the defaults, nine of ten starts are within 10 cm of the hand's
-            unchanged first observation, as nearly all robot tests are. At the benchmark's norms half were further away.
+        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        components: Components to sample, each entry with equal probability. The default has three entries
+            ``controller_posture``, the benchmark's own component, and one entry ``initial_joints``.
+        norm_rad: Norm of the offsets of ``controller_posture`` at each level, in rad; the benchmark's norms by default.
+        initial_norm_rad: Norm of the offsets of ``initial_joints`` at each level, in rad. At the defaults, nine of ten
+            hands start within 10 cm of their unchanged place, as in nearly all robot tests. At the benchmark's norms,
+            half of them start further away.
     """
 
     draws: ClassVar = (RobotPerturbation,)

@@ -1,17 +1,15 @@
 """A user's folder as a source of textures or of object models."""
 
-from pydantic import BaseModel
-
-from pipeline.types import Place
+from pipeline.types import Frozen, Place
 
 
-class Folder(BaseModel, frozen=True, extra="forbid"):
+class Folder(Frozen):
     """Folder of textures or objects that the user has a right to use.
 
     Attributes:
-        folder: path of the folder. Textures are the PNG and JPEG files in it and its subfolders. Objects are
+        folder: Path of the folder. Textures are the PNG and JPEG files in it and its subfolders. Objects are
             ``<category>/<name>.obj`` (y up, in metres) and ``<category>/<name>.xml`` (MJCF, z up).
-        licence: licence of the textures or objects, recorded with every episode that shows one of them.
+        licence: Licence of the textures or objects, recorded with every episode that shows one of them.
     """
 
     folder: Place

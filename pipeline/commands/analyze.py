@@ -1,4 +1,4 @@
-"""Group ``analyze``: commands about results of policies and about runs. Each prints one line of JSON last."""
+"""Group ``analyze``: commands about results of policies and about runs. The last line of their output is JSON."""
 
 import json
 from pathlib import Path
@@ -6,20 +6,21 @@ from typing import Any
 
 import click
 
-from pipeline.commands.base import PATH, Command, LazyGroup, Listed, config_argument, open_run
+from pipeline.commands.base import PATH, Command, LazyGroup, Listed, config_argument, example, open_run
 from pipeline.errors import PipelineError
 from pipeline.files import refuse_other_file, write_json
 
 analyze = LazyGroup(
     "analyze",
     help="Report on results of policies, and compare runs with the test tasks.",
+    epilog=example("analyze report results/act results/pi05", "analyze coverage configs/starter.yaml"),
     sections={
         "Commands": {
             "report": Listed("analyze", "Write an HTML page and a JSON file about evaluations."),
             "coverage": Listed("analyze", "Compare the observations of a run with those of the test tasks."),
             "gap": Listed("analyze", "Measure the compositional gap of pairs of perturbations."),
             "construct": Listed("analyze", "Sample and balance a benchmark of held-out perturbations."),
-            "grade": Listed("analyze", "Grade the difficulty of tasks by the models that solve them."),
+            "grade": Listed("analyze", "Grade the difficulty of tasks by the number of models that solve them."),
             "leakage": Listed("analyze", "Measure how close held-out perturbations come to a run's plan."),
         }
     },
@@ -28,13 +29,13 @@ analyze = LazyGroup(
 results_argument = click.argument("results", metavar="DIR", type=PATH, help="Folder of the results.")
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("analyze report results/act results/pi05 --out report.html"))
 @click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=PATH, help="Folders of results.")
 @click.option(
     "--across",
     multiple=True,
     type=click.Choice(("prompt", "step_limit", "black")),
-    help="Compare results that differ in this, which is rejected otherwise; may be given several times.",
+    help="Setting in which the compared results may differ; may be given several times (default: none).",
 )
 @click.option(
     "--out",
@@ -46,9 +47,9 @@ results_argument = click.argument("results", metavar="DIR", type=PATH, help="Fol
 def report(folders: tuple[Path, ...], across: tuple[Any, ...], out: Path) -> None:
     """Write an HTML page and a JSON file about evaluations: rates, the paper's table, comparisons, failures.
 
-    The folders are results of `evaluate`, from one machine or several, and of different policies. Two different results
-    of one episode are an error, and so are results under different prompts, step limits, black views or starts. The
-    last line is JSON.
+    The folders are results of `evaluate`, from one or several machines, and of one or several policies. Two different
+    results of one episode are an error, and so are results with different prompts, step limits, black views or starts.
+    The last line of the output is JSON.
     """
     from pipeline.evaluation.results import read
     from pipeline.report import evaluation_report
@@ -56,14 +57,14 @@ def report(folders: tuple[Path, ...], across: tuple[Any, ...], out: Path) -> Non
     print(json.dumps(evaluation_report.write(read(folders, across), out)))
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("analyze coverage configs/starter.yaml"))
 @config_argument
 def coverage(config: Path) -> None:
     """Compare the observations of a finished run with those of the benchmark's test tasks.
 
-    The measures are, axis by axis: first observations, displacements of hand and targets, places of added objects,
-    changed shares of a view, grey levels and words. The last line is JSON: number, tenth, fiftieth and ninetieth
-    percentile of each measure.
+    The printed table has measures of each axis: first observations, displacements of hand and targets, places of added
+    objects, changed shares of a view, grey levels and words. The last line is JSON, with the number, the tenth, the
+    fiftieth and the ninetieth percentile of each measure.
     """
     from rich.console import Console
     from rich.table import Table
@@ -72,8 +73,8 @@ def coverage(config: Path) -> None:
     from pipeline.testset import benchmark
 
     measures = seen.measure(open_run(config), benchmark.load())
-    table = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
-    table.caption = "A run adds each number of objects equally often, unless it is configured otherwise."
+    table = Table("axis", "visible effect: median (tenth to ninetieth percentile)", "test tasks", "this run")
+    table.caption = "Each number of added objects is equally frequent in a run with the default levels."
     figures: dict[str, Any] = {}
     for measure in measures:
         cells = ["-" if spread is None else str(spread) for spread in (measure.tested, measure.ours)]
@@ -83,10 +84,14 @@ def coverage(config: Path) -> None:
     print(json.dumps(figures))
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("analyze gap results/pairs"))
 @results_argument
 def gap(results: Path) -> None:
-    """Measure the compositional gap of pairs, results of --source pairs, into gap.json and gap.png in their folder."""
+    """Measure the compositional gap of pairs of perturbations.
+
+    The results are those of `evaluate --source pairs`. The command writes gap.json and gap.png into their folder. The
+    last line of the output is JSON.
+    """
     from pipeline.evaluation import composition
     from pipeline.evaluation.results import stored
 
@@ -100,21 +105,31 @@ def gap(results: Path) -> None:
     print(json.dumps(figures))
 
 
-@click.command(cls=Command)
-@click.option("--out", metavar="FILE", type=PATH, required=True, help="List of tasks to write.")
-@click.option("--size", metavar="N", type=click.IntRange(min=1), help="Tasks of the benchmark (default: 10,000).")
+@click.command(cls=Command, epilog=example("analyze construct --out tasks.json --size 1000"))
+@click.option("--out", metavar="FILE", type=PATH, required=True, help="File of the list of tasks to write.")
 @click.option(
-    "--results", metavar="DIR", multiple=True, type=PATH, help="Results of candidates; may be given several times."
+    "--size", metavar="N", type=click.IntRange(min=1), help="Number of tasks of the benchmark (default: 10,000)."
 )
 @click.option(
-    "--trained-on", metavar="CONFIG", type=PATH, help="Leave out perturbations that overlap with the plan of this run."
+    "--results",
+    metavar="DIR",
+    multiple=True,
+    type=PATH,
+    help="Results of candidates, of which rejected ones are left out; may be given several times.",
+)
+@click.option(
+    "--trained-on",
+    metavar="CONFIG",
+    type=PATH,
+    help="Configuration of training data; perturbations that overlap with its plan are left out.",
 )
 @click.option("--seed", type=int, default=0, help="Seed of all perturbations (default: 0).")
 def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on: Path | None, seed: int) -> None:
     """Sample 14,000 held-out perturbations as candidates, and filter and balance them to a benchmark.
 
-    The file is for `evaluate --tasks-from`. Some scenes reject their perturbation, which shows only when candidates are
-    run: with --results, those tasks are left out.
+    The command writes a list of tasks, which `evaluate --tasks-from` reads. Some scenes reject their perturbation, and
+    only an evaluation of the candidates shows it: with --results, these tasks are left out. The last line of the output
+    is JSON.
     """
     from pipeline.evaluation import own_draws, selection
     from pipeline.evaluation.results import stored
@@ -129,11 +144,15 @@ def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on
     print(json.dumps(counts))
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("analyze grade results/act results/pi05 --out graded.json"))
 @click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=PATH, help="Results of one model each.")
-@click.option("--out", metavar="FILE", type=PATH, required=True, help="List of tasks with their difficulty.")
+@click.option("--out", metavar="FILE", type=PATH, required=True, help="File of the list of graded tasks to write.")
 def grade(folders: tuple[Path, ...], out: Path) -> None:
-    """Grade the difficulty of tasks, 1 to 5, by how many of several models solve each."""
+    """Grade the difficulty of tasks, 1 to 5, by the number of models that solve each task.
+
+    The command writes a list of the tasks with their difficulty, which `evaluate --tasks-from` reads. The last line of
+    the output is JSON.
+    """
     from pipeline.evaluation import statistics
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.task_list import refuse_other_list, write_tasks
@@ -145,7 +164,9 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
         seeds.update(row.seed for row, _ in results_of_model)
     seed, *further_seeds = sorted(seeds)
     if further_seeds:
-        raise PipelineError(f"results of seeds {sorted(seeds)}", expected="one seed, and so the same draws")
+        raise PipelineError(
+            f"the results have the seeds {sorted(seeds)}", expected="one seed, and therefore the same perturbations"
+        )
     graded = statistics.grade(results)
     write_tasks(graded, seed, out)
     difficulties = [task["difficulty"] for task in graded]
@@ -153,13 +174,14 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
     print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("analyze leakage results/own configs/starter.yaml"))
 @results_argument
 @config_argument
 def leakage(results: Path, config: Path) -> int:
     """Measure how close the held-out perturbations of results come to the plan of a run.
 
-    The exit status is 1 if one overlaps.
+    The results are those of `evaluate --source own`. The output is one line of JSON. The exit status is 1 if a
+    perturbation overlaps with the plan.
     """
     from pipeline.axes import from_json
     from pipeline.evaluation import own_draws
@@ -173,8 +195,9 @@ def leakage(results: Path, config: Path) -> int:
         for perturbation in from_json(json.dumps(row.perturbations)):
             perturbations.append((row.name, perturbation, find_task(row.suite, row.base)))
     if not perturbations:
-        lacking = "there are no held-out perturbations"
-        raise PipelineError(lacking, where=results, remedy="evaluate --source own")
+        raise PipelineError(
+            "the results have no held-out perturbations", where=results, remedy="run `evaluate --source own`"
+        )
     findings = own_draws.compare(perturbations, own_draws.planned(open_run(config).plan_file))
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

@@ -6,22 +6,26 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.base import LazyGroup, Listed
+from pipeline.commands.base import PROGRAM, LazyGroup, Listed
 from pipeline.exit_status import exit_status
 
 DESCRIPTION = """\
 Generate perturbed fine-tuning data from LIBERO demonstrations.
 
-A run is one configuration, a file such as configs/starter.yaml. A command about a run takes its configuration as the
-last argument.
+A run is one configuration, a file such as configs/starter.yaml. All files of a run are written into one folder, by
+default data/<name>. A command about a run takes its configuration as the last argument.
 """
-EXAMPLES = """\
+EXAMPLES = f"""\
 \b
 Examples:
-  python -m pipeline run configs/starter.yaml                  about 47 episodes of eight axes, in minutes
-  python -m pipeline preview 'libero_goal/turn_on*' camera     an axis on a task, as a picture
-  python -m pipeline demos fetch data/demos libero_goal        all 50 demonstrations of each task, from the hub
-  python -m pipeline COMMAND --help                            arguments and options of a command
+  Generate about 47 episodes of eight axes, in minutes:
+    {PROGRAM} run configs/starter.yaml
+  Render perturbations of the camera in a task into one picture:
+    {PROGRAM} preview 'libero_goal/turn_on*' camera
+  Download all 50 demonstrations of each task of a suite:
+    {PROGRAM} demos fetch data/demos libero_goal
+  Show the arguments and options of a command:
+    {PROGRAM} COMMAND --help
 """
 MOVED = {
     "check": "dataset check",
@@ -40,7 +44,7 @@ top = LazyGroup(
     sections={
         "Generate datasets": {
             "run": Listed("runs", "Generate the datasets of a configuration, or their missing parts."),
-            "status": Listed("runs", "Show wanted and kept episodes, pending stages, disk and time."),
+            "status": Listed("runs", "Show wanted and kept episodes, stages to run, disk and time."),
             "clean": Listed("runs", "Delete files that a run can generate again."),
         },
         "Before a run": {
@@ -76,7 +80,7 @@ def run(words: Sequence[str] | None = None) -> int:
         Exit status.
     """
     installed = Path(sys.argv[0]).name == "perturbed-libero"
-    name = "perturbed-libero" if installed else "python -m pipeline"
+    name = "perturbed-libero" if installed else PROGRAM
 
     def call() -> int:
         try:

@@ -8,12 +8,13 @@ from typing import Any
 
 import click
 
-from pipeline.commands.base import PATH, Command, LazyGroup, Listed, OneOf, config_argument, open_run
+from pipeline.commands.base import PATH, Command, LazyGroup, Listed, OneOf, config_argument, example, open_run
 from pipeline.errors import PipelineError
 
 dataset = LazyGroup(
     "dataset",
     help="Check, audit, regenerate or push a dataset.",
+    epilog=example("dataset check configs/starter.yaml", "dataset push lerobot me/my-dataset configs/starter.yaml"),
     sections={
         "Commands": {
             "check": Listed("dataset", "Compare all files of a run with their checksums."),
@@ -25,14 +26,14 @@ dataset = LazyGroup(
 )
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("dataset check configs/starter.yaml"))
 @config_argument
 def check(config: Path) -> int:
-    """Compare all files of a run with their checksums, and read its RLDS sets as OpenVLA-OFT does.
+    """Compare all files of a run with their checksums, and read its RLDS datasets as OpenVLA-OFT does.
 
-    Files that differ from what was written are listed, and so is all that would mislead OpenVLA-OFT's training. The
-    last line is JSON. The exit status is 1 if something is listed: move a damaged file away, and the run generates it
-    again. (The stage validate, a part of every run, compares the datasets with each other and with the plan.)
+    Damaged files are listed, and faults that would mislead OpenVLA-OFT's training. The last line is JSON. The exit
+    status is 1 if there is such a file or fault. Move a damaged file to another place, and the run generates it again.
+    The stage validate, a part of every run, compares the datasets with each other and with the plan.
     """
     from pipeline.clients import oft
     from pipeline.run.layout import STATISTICS
@@ -57,17 +58,21 @@ def check(config: Path) -> int:
     return int(bool(damaged or misleading))
 
 
-@click.command(cls=Command)
-@click.argument("dataset", metavar="DATASET", type=PATH, help="Folder of an RLDS or LeRobot set of any origin.")
+@click.command(cls=Command, epilog=example("dataset audit data/starter/lerobot"))
+@click.argument("dataset", metavar="DATASET", type=PATH, help="Folder of an RLDS or LeRobot dataset of any origin.")
 @click.option(
-    "--manifest", metavar="FILE", type=PATH, help="Labels of episodes that lost theirs and kept their episode_id."
+    "--manifest",
+    metavar="FILE",
+    type=PATH,
+    help="Manifest with the labels of episodes that lost their labels and kept their episode_id.",
 )
 def audit(dataset: Path, manifest: Path | None) -> int:
     """Measure how close a dataset comes to the test tasks of the benchmark.
 
-    The instruction of every episode is compared. Matrices of the agent view and labels of this project are compared
-    if the dataset has them, even after it was edited, merged or filtered. Episodes that cannot be compared are counted.
-    The last line is JSON. The exit status is 1 if an episode overlaps with a test task.
+    The instruction of every episode is compared. Camera matrices of the agent view and labels of this project are
+    compared if the dataset has them, even after it was edited, merged or filtered. Distances and the number of episodes
+    without a comparison are printed as tables. The last line is JSON. The exit status is 1 if an episode overlaps with
+    a test task.
     """
     from dataclasses import asdict
 
@@ -80,19 +85,19 @@ def audit(dataset: Path, manifest: Path | None) -> int:
     result = audit.audit(dataset, benchmark.load(), manifest)
     rich.print(leakage.report(result.axes))
     for axis, number in result.unknown.items():
-        print(f"{axis}: not known of {number:,} of {result.episodes:,} episodes: no labels, no text, or no known task")
+        print(f"{axis}: unknown for {number:,} of {result.episodes:,} episodes, without labels, text or a known task")
     print(json.dumps(asdict(result) | {"unknown": result.unknown}))
     return int(any(finding.overlaps for finding in result.axes.values()))
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("dataset regenerate 0123456789abcdef configs/starter.yaml --out again"))
 @click.argument("episode_id", metavar="EPISODE_ID", help="Identifier as in the manifest and in the datasets.")
 @click.argument(
     "config",
     metavar="[CONFIG]",
     required=False,
     type=PATH,
-    help="File of the run's configuration; without it, give --manifest.",
+    help="File of the run's configuration; for a dataset without a run, give --manifest instead.",
 )
 @click.option("--out", metavar="DIR", type=PATH, required=True, help="New folder for the regenerated episode.")
 @click.option("--manifest", metavar="FILE", type=PATH, help="Manifest of a dataset without a run.")
@@ -100,14 +105,14 @@ def audit(dataset: Path, manifest: Path | None) -> int:
     "--demos",
     metavar="DIR",
     type=PATH,
-    help="With --manifest: the HDF5 demonstrations that the dataset was generated from.",
+    help="With --manifest: folder of the HDF5 demonstrations that the dataset was generated from.",
 )
 def regenerate(episode_id: str, config: Path | None, out: Path, manifest: Path | None, demos: Path | None) -> int:
     """Generate one episode again from the manifest and its demonstration, and compare it byte for byte.
 
-    The episode is replayed, rendered and serialised again. The last line is JSON: whether it equals the record in the
-    RLDS set next to the manifest, which columns differ, and which versions and OpenGL device are not those of the
-    manifest. The exit status is 1 if it is not identical.
+    The episode is replayed, rendered and serialised again, into the folder of --out. The last line is JSON. It states
+    if the episode equals the record in the RLDS dataset next to the manifest, and lists the columns, versions and
+    OpenGL devices that differ. The exit status is 1 if the episodes differ.
     """
     from pipeline.validation import regenerate
 
@@ -115,7 +120,9 @@ def regenerate(episode_id: str, config: Path | None, out: Path, manifest: Path |
         raise click.UsageError("Missing argument 'CONFIG', or option '--manifest'.")
     if (manifest is None and demos is not None) or (manifest is not None and config is not None):
         raise PipelineError(
-            "two places to take the demonstrations from", where="options", expected="CONFIG, or --manifest and --demos"
+            "the options name two sources of demonstrations",
+            where="options",
+            expected="either CONFIG, or --manifest and --demos",
         )
     if config is not None:
         run = open_run(config)
@@ -123,7 +130,7 @@ def regenerate(episode_id: str, config: Path | None, out: Path, manifest: Path |
     assert manifest is not None
     result = regenerate.regenerate(episode_id, manifest, out, demos)
     if result["identical"] is None:
-        print(f"only made, in {out}: no RLDS set lies beside {manifest} to compare it with", file=sys.stderr)
+        print(f"generated {out} without a comparison: no RLDS dataset is next to {manifest}", file=sys.stderr)
     print(json.dumps(result))
     return int(result["identical"] is False or result["reason"] != "kept")
 
@@ -134,25 +141,29 @@ def _formats() -> Iterable[str]:
     return [kind.name for kind in FORMATS]
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("dataset push lerobot me/my-dataset configs/starter.yaml --really"))
 @click.argument("format_name", metavar="FORMAT", type=OneOf(_formats), help="Format of the dataset, such as lerobot.")
 @click.argument("repository", metavar="REPOSITORY", help="Repository <owner>/<name> on the hub.")
 @config_argument
-@click.option("--really", is_flag=True, help="Upload.")
-@click.option("--private", is_flag=True, help="Create a private repository; reject a public one.")
-@click.option("--replace", is_flag=True, help="Delete all but an earlier upload of the same run and format.")
+@click.option("--really", is_flag=True, help="Upload the files instead of listing them.")
+@click.option("--private", is_flag=True, help="Create a private repository, and reject a public one.")
+@click.option(
+    "--replace",
+    is_flag=True,
+    help="Overwrite or delete other files in the repository; without it, a repository with other files is rejected.",
+)
 def push(format_name: str, repository: str, config: Path, really: bool, private: bool, replace: bool) -> None:
-    """Upload a run's dataset with its card to the Hugging Face hub; without --really, list what would be uploaded.
+    """Upload a run's dataset with its card to the Hugging Face hub. Without --really, only list the files.
 
     One dataset of a finished and validated run is uploaded in one commit: its files, the card, the manifest and
-    finetune/. Files must be as recorded. A repository with anything but an earlier upload of the same run and format
-    is rejected. An upload that was stopped resumes. A token is read from HF_TOKEN or `hf auth login`, the address of
-    another hub from HF_ENDPOINT.
+    finetune/. Files must be unchanged since they were recorded. A repository with other files than an earlier upload of
+    the same run and format is rejected. A stopped upload resumes when the command is called again. The token is read
+    from HF_TOKEN or `hf auth login`, and the address of another hub from HF_ENDPOINT.
     """
     run = open_run(config)
     if format_name not in run.config.export.formats:
         raise PipelineError(
-            f"the run has no {format_name}",
+            f"the run has no {format_name} dataset",
             where=f"export.{format_name}",
             expected=" or ".join(run.config.export.formats),
         )
@@ -165,4 +176,4 @@ def push(format_name: str, repository: str, config: Path, really: bool, private:
         print(push.send(upload, repository, **options))
         return
     print(push.compare(upload, repository, **options))
-    print(f"nothing was sent: with --really this goes to {repository}")
+    print(f"no file was uploaded: add --really to upload these files to {repository}")

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from pipeline.commands.base import Command
+from pipeline.commands.base import Command, example
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 PAGE = SCHEMAS.parent / "docs" / "fields.md"
@@ -22,9 +22,9 @@ def schemas() -> dict[str, dict[str, Any]]:
     return {"config.schema.json": config, "manifest.json": manifest.described(registry.columns())}
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("schema"))
 def schema() -> None:
-    """Write the files of schemas/ and the tables of docs/fields.md that follow from the code."""
+    """Write the files that follow from the code: two in schemas/, and the tables of docs/fields.md."""
     from pipeline.field_tables import with_tables
     from pipeline.files import write
 

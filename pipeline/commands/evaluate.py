@@ -7,7 +7,7 @@ from typing import Any
 import click
 from dask.system import CPU_COUNT
 
-from pipeline.commands.base import PATH, Command, given, model_options
+from pipeline.commands.base import PATH, Command, example, given, model_options
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.evaluation.environment import EpisodeSettings
@@ -19,17 +19,23 @@ from pipeline.run import claim
 TRAINED_ON = "Configuration of the policy's training data; held-out perturbations that overlap with it are resampled."
 
 
-@click.command(cls=Command)
+@click.command(
+    cls=Command,
+    epilog=example(
+        "evaluate results/act --checkpoint data/act --source libero_plus --subset 100",
+        "evaluate results/pi05 --server ws://localhost:8000 --label pi05",
+    ),
+)
 @click.argument("out", metavar="DIR", type=PATH, help="Folder of the results.")
 @click.option("--server", metavar="URL", help="Address of a model server, such as ws://localhost:8000.")
-@click.option("--checkpoint", metavar="DIR", type=PATH, help="Policy that lerobot saved.")
+@click.option("--checkpoint", metavar="DIR", type=PATH, help="Folder of a policy that lerobot saved.")
 @click.option(
     "--replay",
     is_flag=False,
     flag_value="open_loop",
     type=click.Choice(("open_loop", "tracked")),
-    help="Replay the demonstrations as a check: their own actions (open_loop, as without a value), or their paths "
-    "followed by feedback (tracked).",
+    help="Replay the demonstrations in place of a policy, as a check: open_loop (the default value) sends their own "
+    "actions, tracked follows their paths by feedback.",
 )
 @model_options(
     Selection,
@@ -54,14 +60,16 @@ TRAINED_ON = "Configuration of the policy's training data; held-out perturbation
     look_every="--look-every",
 )
 @model_options(PolicyConfig, label="--label", timeout_s="--timeout")
-@click.option("--assets", metavar="DIR", type=PATH, help="Folder of LIBERO-Plus's unpacked asset archive.")
+@click.option("--assets", metavar="DIR", type=PATH, help="Folder of the unpacked asset archive of LIBERO-Plus.")
 @click.option(
     "--videos",
     type=click.Choice(("none", "failures", "all")),
     default="none",
-    help="Episodes to film (default: none).",
+    help="Episodes whose videos are stored (default: none).",
 )
-@click.option("--workers", metavar="N", type=click.IntRange(min=1), help="Number of processes (default: one a core).")
+@click.option(
+    "--workers", metavar="N", type=click.IntRange(min=1), help="Number of processes (default: one for each core)."
+)
 def evaluate(
     out: Path,
     server: str | None,
@@ -75,13 +83,14 @@ def evaluate(
 ) -> None:
     """Run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out perturbations of the axes.
 
-    One file is written for each episode, and summary.json with success rates and their 95 % intervals. An evaluation
-    that was stopped resumes. The policy is a model server of vla-eval, which you start, or a checkpoint of lerobot.
+    The command writes a file for each episode into DIR, and summary.json with success rates and their 95 % intervals.
+    The policy is a model server of vla-eval, which you start first, or a checkpoint of lerobot. A stopped evaluation
+    resumes when the command is called again. The last line of the output is JSON.
     """
     policies = {"server": server, "checkpoint": checkpoint, "replay": replay}
     chosen = [name for name, value in policies.items() if value is not None]
     if len(chosen) != 1:
-        raise click.UsageError("Expected one of --server, --checkpoint and --replay.")
+        raise click.UsageError("Expected exactly one of --server, --checkpoint and --replay.")
     (kind,) = chosen
     policy = {"kind": replay} if kind == "replay" else {"kind": kind, "address": str(policies[kind])}
     config = PolicyConfig.model_validate(policy | given(options, PolicyConfig))

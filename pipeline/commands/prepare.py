@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.base import PATH, Command, OneOf, config_argument, load_config
+from pipeline.commands.base import PATH, Command, OneOf, config_argument, example, load_config
 
 PREVIEW = "perturbed-demos: preview"
 """Comment in the pictures of `preview`, which marks files that it may overwrite."""
@@ -18,39 +18,47 @@ DEFAULTS = {"name": "preview", "plan": {"episodes": {}}}
 """Configuration of a preview without a file: the starter demonstrations and default ranges."""
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("doctor configs/starter.yaml"))
 @config_argument
 def doctor(config: Path) -> int:
-    """Check versions, OpenGL, disk, memory and demonstrations for a run; nothing is changed."""
+    """Check versions, OpenGL, disk, memory and demonstrations for a run.
+
+    Each check prints a line that begins with ok, warn or fail, and a remedy below it. No file is written. The exit
+    status is 1 if a check fails.
+    """
     from pipeline.run.run import Run
     from pipeline.validation import doctor
 
     return doctor.run(Run(load_config(config)))
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("axes"))
 def axes() -> None:
-    """List the axes of perturbation, their components, and the parts of an episode that each generates again."""
+    """List the axes of perturbation, their components, and the parts of an episode that each axis generates again."""
     from rich.console import Console
     from rich.table import Table
 
     from pipeline.axes import AXES, components_of
 
-    table = Table("axis", "components", "made again", "changes", box=None)
+    table = Table("axis", "components", "generated again", "changes", box=None, pad_edge=False)
     for axis in AXES:
         kind = AXES[axis].draws[0]
         views = " and ".join(sorted(kind.views)) or "instruction"
         table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
     Console(highlight=False).print(table)
-    print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` shows what an axis does.")
+    print("Ranges and levels: see docs/configuration.md and docs/axes.md.")
+    print("Pictures of an axis: see `python -m pipeline preview --help`.")
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("tasks 'libero_goal/*'"))
 @click.argument(
     "patterns", metavar="[PATTERN]...", nargs=-1, help="Patterns as in demos.tasks, such as 'libero_goal/*'."
 )
 def tasks(patterns: tuple[str, ...]) -> None:
-    """List LIBERO's tasks and your own, by their names in demos.tasks, with their instructions."""
+    """List LIBERO's tasks and your own tasks, by their names in demos.tasks, with their instructions.
+
+    Each printed line has the name <suite>/<task>, a tab and the instruction.
+    """
     from pipeline.libero.tasks import select_tasks
 
     for task in select_tasks(patterns or ["*"]):
@@ -80,7 +88,10 @@ def _axes() -> Iterable[str]:
     return (*AXES, EVERY)
 
 
-@click.command(cls=Command)
+@click.command(
+    cls=Command,
+    epilog=example("preview 'libero_goal/turn_on*' camera", "preview 'libero_10/KITCHEN*' all --out kitchen.jpg"),
+)
 @click.argument("task", metavar="TASK", help="Pattern of <suite>/<task>, such as 'libero_goal/turn_on*'.")
 @click.argument(
     "axis",
@@ -93,7 +104,7 @@ def _axes() -> Iterable[str]:
     metavar="[CONFIG]",
     required=False,
     type=PATH,
-    help="Configuration whose seed, ranges and demonstrations are used; without it, the defaults.",
+    help="Configuration whose seed, ranges and demonstrations are used (default: the starter set and default ranges).",
 )
 @click.option(
     "--out", metavar="FILE", type=PATH, default=Path("sheet.png"), help="Picture to write (default: sheet.png)."
@@ -102,11 +113,11 @@ def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
     """Render perturbations of a task into one picture.
 
     The picture shows the first frame of the task, and up to eleven perturbations over the components and levels of an
-    axis. Several axes joined by +, such as camera+noise, change each picture together. With `all`, the picture shows a
+    axis. Several axes joined by +, such as camera+noise, change each frame together. With `all`, the picture shows a
     perturbation of a middle level on each axis next to the clean twin.
 
-    An axis that the configuration does not name has default ranges. If FILE ends in .jpg, it is a JPEG, else a PNG.
-    Only a picture of an earlier preview is overwritten.
+    The picture is written to sheet.png or to the file of --out: a JPEG if its name ends in .jpg, else a PNG. Only a
+    picture of an earlier preview is overwritten. An axis that the configuration does not name has default ranges.
     """
     from PIL.PngImagePlugin import PngInfo
 
@@ -134,15 +145,16 @@ def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
             metadata.add_text("Software", PREVIEW)
             picture.save(temporary, format="PNG", pnginfo=metadata)
         among = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
-        print(f"{out} shows {axis} on {stage.demo.demo_id}{among}")
+        print(f"wrote {out}, which shows {axis} on {stage.demo.demo_id}{among}")
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("sources configs/starter.yaml"))
 @config_argument
 def sources(config: Path) -> None:
     """Fetch and convert the textures and objects of a configuration, and count them.
 
-    An axis that is not configured counts with its default sources. The last line is JSON.
+    Downloads and converted files are written below data/textures and data/objects, which all runs share. An axis that
+    is not configured counts with its default sources. The last line of the output is JSON.
     """
     from pipeline.axes import AXES
 
@@ -153,29 +165,38 @@ def sources(config: Path) -> None:
     print(json.dumps(numbers))
 
 
-@click.command(cls=Command)
+@click.command(
+    cls=Command,
+    epilog=example(
+        "rewrite tasks/my_suite/my_task.bddl --out bank.yaml --endpoint http://localhost:8000/v1 --model my-model"
+    ),
+)
 @click.argument("bddl_file", metavar="BDDL_FILE", type=PATH, help="File of the task, <suite>/<task>.bddl.")
-@click.option("--out", metavar="FILE", type=PATH, required=True, help="Bank to extend or to begin, such as bank.yaml.")
+@click.option("--out", metavar="FILE", type=PATH, required=True, help="Bank to extend or create, such as bank.yaml.")
 @click.option(
     "--per-class",
     metavar="N",
     type=click.IntRange(min=1),
     default=9,
-    help="Rewrites wanted of each class (default: 9).",
+    help="Number of rewrites of each class in the finished bank (default: 9).",
 )
 @click.option(
-    "--endpoint", metavar="URL", required=True, help="Address before /chat/completions: http://localhost:8000/v1."
+    "--endpoint",
+    metavar="URL",
+    required=True,
+    help="Address of the endpoint before /chat/completions, such as http://localhost:8000/v1.",
 )
 @click.option("--model", metavar="NAME", required=True, help="Name of the model at the endpoint.")
 def rewrite(bddl_file: Path, out: Path, per_class: int, endpoint: str, model: str) -> None:
-    """Add rewrites of a task's instruction by a language model to a bank.
+    """Add rewrites of a task's instruction to a bank, generated by a language model.
 
-    An OpenAI-compatible endpoint is asked for rewrites of each class (distraction, common sense, reasoning chain,
-    paraphrase) until the bank has enough of each. A rewrite must pass the same lint as the shipped bank. A stopped
-    command resumes when it is called again. A key is read from OPENAI_API_KEY.
+    The bank is the YAML file of --out, which plan.axes.language.bank of a configuration then names. An
+    OpenAI-compatible endpoint generates rewrites of each class (distraction, common sense, reasoning chain,
+    paraphrase) until the bank has enough of each class. A rewrite must pass the same checks as the shipped bank. A
+    stopped command resumes when it is called again. The key of the endpoint is read from OPENAI_API_KEY.
     """
     from pipeline.rewriting.language_model import LanguageModel
     from pipeline.rewriting.rewrite import extend
 
     extend(bddl_file, out, per_class, LanguageModel(endpoint, model))
-    print(f"{out} holds {per_class} rewrites of each class for {bddl_file.stem}")
+    print(f"{out} contains {per_class} rewrites of each class for {bddl_file.stem}")

@@ -9,21 +9,22 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.base import Command, OneOf, config_argument, open_run
+from pipeline.commands.base import Command, OneOf, config_argument, example, open_run
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
     from pipeline.run.run import Run
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("run configs/starter.yaml"))
 @config_argument
 def run(config: Path) -> None:
     """Generate the datasets of a configuration, or their missing parts, and list them.
 
-    The stages are performed in order. A stage whose results are up to date is left out. A run can be stopped at any
-    time and resumes when the command is called again. The configuration may be any file. The folder of the run is
-    <folder>/<name>, by default data/<name>, below the current folder.
+    All files are written into the folder of the run: <folder>/<name> of the configuration, by default data/<name>,
+    below the current folder. They are the datasets, the manifest, the report and the dataset cards, and the plan,
+    trajectories and frames behind them. The stages are performed in order, and a stage whose results are up to date is
+    skipped. A run can be stopped at any time, and resumes when the command is called again.
     """
     from pipeline import stages
     from pipeline.run import counts
@@ -54,12 +55,12 @@ def results(run: Run) -> dict[str, Path]:
     }
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("status configs/starter.yaml"))
 @config_argument
 def status(config: Path) -> None:
-    """Show wanted and kept episodes, the stages that would run and why, and their disk and time.
+    """Show the wanted and kept episodes of a run, the stages that would run and the reasons, disk and time.
 
-    Nothing is changed.
+    The command reads the folder of the run and writes no file.
     """
     from rich.console import Console
 
@@ -76,18 +77,22 @@ def _parts() -> Iterable[str]:
     return cleaning.PARTS
 
 
-@click.command(cls=Command)
+@click.command(cls=Command, epilog=example("clean --only pictures configs/starter.yaml"))
 @config_argument
 @click.option(
-    "--only", multiple=True, type=OneOf(_parts), metavar="PART", help="A part to delete; may be given several times."
+    "--only",
+    multiple=True,
+    type=OneOf(_parts),
+    metavar="PART",
+    help="Part to delete, such as pictures, frames or trajectories; may be given several times (default: all parts).",
 )
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--yes", is_flag=True, help="Delete without a question.")
 def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     """Delete files that a run can generate again.
 
-    The parts and their sizes are listed before you are asked. Other files in the folder of the run stay.
-    Demonstrations, configurations and downloads are not touched. A folder that no run has marked is an error, and so
-    is a foreign file inside a folder to delete.
+    The command lists the parts, their sizes and the stages that generate them again, and then asks for permission.
+    Other files in the folder of the run stay, and so do demonstrations, configurations and downloads. The command stops
+    if the folder has no mark of a run, or if a folder to delete contains a file that no stage generated.
     """
     from pipeline.generated import edits_in_words
     from pipeline.run import claim, cleaning, foreign
@@ -96,10 +101,10 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     claim.refuse_unmarked(run.folder)
     size_of_part = cleaning.found(run, only or tuple(cleaning.PARTS))
     if not size_of_part:
-        print(f"{run.folder} has nothing of this")
+        print(f"{run.folder} has no files of these parts")
         return
     for part, size_mb in size_of_part.items():
-        print(f"{size_mb:10.1f} MB  {part:<13} made again by {cleaning.PARTS[part].made_by}")
+        print(f"{size_mb:10.1f} MB  {part:<13} generated again by {cleaning.PARTS[part].made_by}")
     print(f"{sum(size_of_part.values()):10.1f} MB  in all, of {run.folder}")
     for edit in edits_in_words(run.folder) if "uploads" in size_of_part else ():
         print(edit)
@@ -109,8 +114,8 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     foreign.refuse_foreign_files(run.folder, names)
     if not yes:
         if not sys.stdin.isatty():
-            raise PipelineError("nothing was deleted, as nobody can be asked here", remedy="add --yes")
-        if input("Delete all of this? [y/N] ").strip().lower() not in ("y", "yes"):
+            raise PipelineError("nothing was deleted, because there is no terminal to ask in", remedy="add --yes")
+        if input("Delete these files? [y/N] ").strip().lower() not in ("y", "yes"):
             print("nothing was deleted")
             return
     cleaning.delete(run, list(size_of_part))

@@ -72,14 +72,14 @@ class Workplace:
         """
         reasons = []
         if not (self.token.is_file() and self.folder.is_dir()):
-            reasons.append(f"does not see {self.token.parent}, or another folder lies at that path there")
+            reasons.append(f"does not see {self.token.parent}, or sees another folder at this path")
         here = setup()
         for name, version_of_run in self.setup.items():
             if here.get(name) != version_of_run:
-                reasons.append(f"has {name} {here.get(name, 'not installed')}, the run has {version_of_run}")
+                reasons.append(f"has {name} {here.get(name, 'not installed')}, but the run has {version_of_run}")
         threads = dask_worker.state.nthreads
         if threads != 1:
-            reasons.append(f"runs {threads} threads, and the simulator needs a process for itself")
+            reasons.append(f"runs {threads} threads, but the simulator needs a process with one thread")
         return reasons
 
 

@@ -30,13 +30,13 @@ ALONE_S = 30
 """Time to wait for a worker if none is left."""
 
 LOOK_S = 5
-"""Time between two looks for workers, while no work ends."""
+"""Time between two checks for workers, while no work ends."""
 
 LOST = "worker_lost"
 """Reason of an item that was dropped because no worker survives or finishes it."""
 
 TRIES = 2
-"""Number of workers that end over an item before the item counts as the cause and is tried as often alone."""
+"""Number of workers that end over an item before the item counts as the cause. It is then tried as often alone."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _started(compute_config: ComputeConfig, folder: Path, renders: bool) -> Iter
             raise PipelineError(
                 f"no Dask scheduler answers ({error})",
                 where=compute_config.cluster,
-                remedy="start one, or set compute.cluster: local",
+                remedy="start a scheduler, or set compute.cluster: local",
             ) from error
         with client, workplace_of(client, folder) as workplace:
             yield _Workers(client, workplace)
@@ -227,7 +227,7 @@ class _Workers:
                     yield numbers.pop(future.key), error
                     continue
                 except (CancelledError, CommClosedError, ConnectionError) as error:
-                    raise self._lost("the Dask scheduler went away") from error
+                    raise self._lost("the Dask scheduler no longer answers") from error
                 yield numbers.pop(future.key), result
         finally:
             # A client whose scheduler has just died may still call itself running.
@@ -248,14 +248,15 @@ class _Workers:
             except Empty:
                 self.refill()
                 workers, came_s = self._there()
-                # A new worker may be starting, or may have come and died over its work.
+                # A new worker may be starting, or may have connected and died over its work.
                 alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
                 last_came_s = came_s
                 if alone_s >= self.patience_s:
-                    raise self._lost(f"no worker is left, and none came in {self.patience_s} s") from None
+                    what = f"no worker is left, and no new worker connected within {self.patience_s} s"
+                    raise self._lost(what) from None
 
     def _there(self) -> tuple[int, float]:
-        """Return the number of workers, and the time when the last one came, by the scheduler's clock."""
+        """Return the number of workers, and the time when the last worker connected, by the scheduler's clock."""
         try:
             events = self.client.get_events("all")
             came_s = [stamp for stamp, event in events if event.get("action") == "add-worker"]
@@ -264,16 +265,17 @@ class _Workers:
             return 0, 0.0
 
     def _lost(self, what: str) -> PipelineError:
-        return PipelineError(what, where=self.client.scheduler.address, remedy=f"start it again, and {GO_ON}")
+        remedy = f"start the scheduler and its workers again, and {GO_ON}"
+        return PipelineError(what, where=self.client.scheduler.address, remedy=remedy)
 
 
 def _result(outcome: Result | Exception) -> Result:
-    """Return a result, or raise the error; if workers died over the item, raise an error that says so."""
+    """Return a result, or raise the error. If workers died over the item, the raised error states this."""
     from distributed import KilledWorker
 
     if isinstance(outcome, KilledWorker):
-        what = f"one piece of work ended {outcome.allowed_failures + 1} workers"
-        raise ended(what, f"the last was {outcome.last_worker.address}")
+        what = f"one item of work ended {outcome.allowed_failures + 1} workers"
+        raise ended(what, f"last worker {outcome.last_worker.address}")
     if isinstance(outcome, Exception):
         raise outcome
     return outcome

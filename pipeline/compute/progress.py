@@ -1,4 +1,4 @@
-"""Progress of the work, in a terminal and in a log."""
+"""Progress of work, as a bar in a terminal and as lines in a log."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ SAID_EVERY_S = 60.0
 
 @contextmanager
 def progress_of(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar with rate and ETA on a terminal; in a log, print a line every tenth of the work and every minute."""
+    """Show a bar with rate and remaining time in a terminal; print a line to a log for every tenth and every minute."""
     # Every process of a run imports this module, but few show progress.
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn

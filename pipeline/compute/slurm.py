@@ -1,4 +1,4 @@
-"""Workers as jobs of SLURM, which wait in its queue until it has room."""
+"""Workers as SLURM jobs, which wait in SLURM's queue until resources are free."""
 
 import subprocess
 import sys
@@ -19,13 +19,13 @@ LOGS = Path(".work") / "slurm"
 """Folder, below the run's, of the jobs' output."""
 
 STARTS = 2
-"""Number of jobs that may end before their worker starts, as a multiple of the workers."""
+"""Number of jobs that may end before their worker starts, as a multiple of the number of workers."""
 
 LOOK_S = 5
-"""Time between two looks at the queue while no worker has started."""
+"""Time between two checks of the queue while no worker has started."""
 
 LINES_SHOWN = 8
-"""Last lines of a job's output in an error."""
+"""Number of last lines of a job's output in an error."""
 
 
 @dataclass
@@ -80,7 +80,7 @@ class SlurmJobs:
         if self.in_vain + len(ended) < STARTS * self.workers:
             if ended:
                 self.in_vain += len(ended)
-                print(f"{len(ended)} jobs of SLURM ended before their worker started: see {self.logs}", file=sys.stderr)
+                print(f"{len(ended)} SLURM jobs ended before their worker started: see {self.logs}", file=sys.stderr)
                 self.cluster.sync(self.cluster.scale_down, list(ended))
             self.cluster.scale(self.workers)
         elif not connected and len(ended) == len(jobs):
@@ -95,7 +95,7 @@ class SlurmJobs:
         return PipelineError(
             "\n".join([what, *self._last_lines(last)]),
             where=self.logs,
-            expected="jobs in which `dask worker` starts and reaches this machine",
+            expected="jobs in which `dask worker` starts and connects to this machine",
             remedy=f"correct compute.slurm or the site's jobqueue.yaml, and {GO_ON}",
         )
 
@@ -187,8 +187,8 @@ def _try(script: str) -> None:
         refusal = str(error)
     if refusal:
         raise PipelineError(
-            f"takes no job ({refusal})",
+            f"SLURM rejects the job ({refusal})",
             where="sbatch",
-            expected="a machine from which SLURM's jobs can be started, and options that it knows",
-            remedy="mend compute.slurm, or set compute.cluster: local",
+            expected="a machine that can submit SLURM jobs, and options that SLURM knows",
+            remedy="correct compute.slurm, or set compute.cluster: local",
         )

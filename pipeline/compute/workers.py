@@ -87,10 +87,9 @@ def _started(workers: int) -> Any:
 
 def ended(what: str, where: str | None = None) -> PipelineError:
     """Return the error for workers that ended for an unknown reason."""
-    expected = "workers that live: the system may have ended them because memory ran out"
-    return PipelineError(
-        what, where=where, expected=expected, remedy=f"see the system's log, use fewer workers, and {GO_ON}"
-    )
+    expected = "workers that finish their work; the system may have ended them because memory ran out"
+    remedy = f"read the system's log, reduce compute.workers, and {GO_ON}"
+    return PipelineError(what, where=where, expected=expected, remedy=remedy)
 
 
 @contextmanager

@@ -45,8 +45,10 @@ class FormatOptions(Frozen):
     excluded at its default.
 
     Attributes:
-        name: name of the dataset, or first part of the names of its sets.
-        validation: share of each task's demonstrations in the split ``val``; a format declares it after its own fields.
+        name: Name of the dataset, or first part of the names of its sets; ``libero_`` and the name of the run by
+            default.
+        validation: Share of each task's demonstrations in the split ``val``, 0 or 0.001 to 0.5; 0 by default. A format
+            declares the field after its own fields.
     """
 
     name: Name = ""

@@ -23,9 +23,11 @@ class RldsConfig(FormatOptions):
     """Options of the RLDS sets.
 
     Attributes:
-        name: what the sets' names begin with; ``libero_`` and the name of the run when left out.
-        shards: TFRecord files, over all sets; when left out, so many that each has about 400 MB.
-        validation: share of each task's demonstrations whose episodes go into the split ``val`` instead of ``train``.
+        name: First part of the names of the sets, which must contain ``libero`` for OpenVLA-OFT; ``libero_`` and the
+            name of the run by default.
+        shards: Number of TFRecord files of all sets together; by default each file has about 400 MB.
+        validation: Share of each task's demonstrations in the split ``val`` instead of ``train``, 0 or 0.001 to 0.5; 0
+            by default.
     """
 
     name: Name = ""

@@ -1,7 +1,8 @@
 """Report on a plan's distances to the benchmark's test tasks: check of the clearance, and coverage of each component.
 
-The two conflict: a plan far from all test tasks overlaps with none, and prepares for none. The report therefore states
-the least distance of any pair and, for each component, the distances from the test tasks to the planned episodes.
+Clearance and coverage conflict: a plan far from all test tasks overlaps with no test task, and prepares for none. The
+report therefore states the least distance of any pair. For each component, it also states the distances from the test
+tasks to the planned episodes.
 
 Every perturbation is read back from the plan and compared again, independently of the planner. A row with several
 perturbations counts for each of its axes: the benchmark perturbs one axis at a time, but each part must keep its
@@ -217,16 +218,19 @@ def write(findings: dict[str, AxisDistance], path: Path) -> None:
 
 def report(findings: dict[str, AxisDistance]) -> Group:
     """Format the findings for people: two tables that fit 80 columns, and the definition of each distance."""
-    table = Table("axis", title="distance to the LIBERO-Plus test set", box=box.SIMPLE)
+    table = Table(title="distance to the LIBERO-Plus test set", box=box.SIMPLE, pad_edge=False)
+    table.add_column("axis", no_wrap=True)
     for column in ("episodes", "tests", "overlaps", "smallest", "clearance"):
-        table.add_column(column, justify="right")
-    table.add_column("verdict")
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("verdict", min_width=len("compared"))
     for axis, finding in findings.items():
         smallest = "-" if finding.smallest is None else f"{finding.smallest:.3g}"
         counts = [f"{count:,}" for count in (finding.rows, finding.test_tasks, finding.overlaps)]
         table.add_row(axis, *counts, smallest, f"{finding.clearance:g}", finding.verdict)
-    covered = Table("axis", "component", title="from each test task to the nearest wanted episode", box=box.SIMPLE)
-    covered.caption = "-: the measure does not tell near from far"
+    covered = Table(
+        "axis", "component", title="distance from each test task to the nearest wanted episode", box=box.SIMPLE
+    )
+    covered.caption = "-: the measure only distinguishes equal from different changes"
     for column in ("tests", "smallest", "median", "90 %", "largest"):
         covered.add_column(column, justify="right")
     for axis, finding in findings.items():
@@ -238,7 +242,7 @@ def report(findings: dict[str, AxisDistance]) -> Group:
     for axis, finding in findings.items():
         if finding.not_compared:
             counts_of_rows = f"{finding.not_compared:,} of {finding.rows:,}"
-            lines.append(f"{axis}: {counts_of_rows} episodes could be compared with no test task")
+            lines.append(f"{axis}: {counts_of_rows} episodes have no comparable test task")
     return Group(table, covered, *map(Text, lines))
 
 
@@ -259,5 +263,5 @@ def refuse_overlap(findings: dict[str, AxisDistance]) -> None:
         raise PipelineError(
             f"planned episodes overlap with the benchmark's test tasks: {'; '.join(faults)}",
             expected="no overlap on any axis",
-            remedy="run the plan stage again: it draws anew where a draw overlaps",
+            remedy="run the plan stage again, which samples overlapping perturbations again",
         )

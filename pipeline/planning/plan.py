@@ -41,27 +41,31 @@ RESET = "reset"
 class Row:
     """Candidate episode: the columns of the plan, which are the first columns of the manifest, with their meanings."""
 
-    episode_id: Annotated[str, "hash of demonstration, perturbations and replay settings; joins RLDS, LeRobot and this"]
-    twin_id: Annotated[str, "episode of the same demonstration without perturbations; a twin's own id"]
-    trajectory_id: Annotated[str, "the physics rendered; shared by episodes that differ in render, pixels or text"]
+    episode_id: Annotated[
+        str, "hash of demonstration, perturbations and replay settings; joins RLDS, LeRobot and the manifest"
+    ]
+    twin_id: Annotated[str, "episode_id of the clean twin; of a clean twin, its own episode_id"]
+    trajectory_id: Annotated[
+        str, "rendered trajectory; episodes that differ only in render, pixel or text layers share it"
+    ]
     role: Annotated[str, "twin or perturbed"]
     suite: Annotated[str, "suite of the task, LIBERO's or another"]
     task: Annotated[str, "name of the task in its suite"]
     demo_id: Annotated[str, "suite/task/key of the source demonstration"]
     demo_sha256: Annotated[str, "hash of the recorded content of the source demonstration"]
-    demo_source: Annotated[str, "where the demonstration was published"]
-    demo_origin: Annotated[str, "human, or expanded: made from a human demonstration by `demos expand`"]
-    demo_origin_sha256: Annotated[str, "demo_sha256 of the human demonstration that it was made from, or its own"]
+    demo_source: Annotated[str, "file or published source of the demonstration, and its name in it"]
+    demo_origin: Annotated[str, "human, or expanded: generated from a human demonstration by `demos expand`"]
+    demo_origin_sha256: Annotated[str, "demo_sha256 of the human demonstration behind an expanded one, else its own"]
     demo_steps: Annotated[int, "recorded actions, no-ops included"]
     axis: Annotated[str, "perturbed axis, several joined by +, or clean"]
     component: Annotated[str, "component of the axis, several joined by +, or clean"]
-    level: Annotated[str, "strength, 1 to 5, several joined by + in the order of component; 0 for a twin"]
+    level: Annotated[str, "strength, 1 to 5, several joined by + in the order of component; 0 for a clean twin"]
     perturbations: Annotated[str, "JSON list with every parameter, deepest layer first"]
     instruction: Annotated[str, "the text that the policy is prompted with"]
     rank: Annotated[int, "place among the candidates of its axis and task"]
-    wanted: Annotated[bool, "false for a reserve, used only where a candidate before it fails"]
-    seed: Annotated[int, "the run's seed; with axis, demo_id and variant the key of the draw"]
-    variant: Annotated[int, "how many draws of this axis this demonstration had before"]
+    wanted: Annotated[bool, "false for a reserve, which is used only if another candidate fails"]
+    seed: Annotated[int, "seed of the run; with axis, demo_id and variant, the key of the perturbations"]
+    variant: Annotated[int, "number of earlier samples of this axis for this demonstration"]
 
     @property
     def reset_seed(self) -> int | None:
@@ -92,9 +96,9 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
         groups = [group for group in by_task.values() if _all_apply(draws.axes, group[0].task)]
         if not groups:
             raise PipelineError(
-                "none of the chosen tasks has anything that this could change",
+                "none of the selected tasks has a thing that these axes can change",
                 where=f"plan.episodes.{name}",
-                remedy="widen demos.tasks, or take it out of plan.episodes",
+                remedy="add tasks to demos.tasks, or remove the entry from plan.episodes",
             )
         by_suite = grouped((group[0].task.suite, group[0].task) for group in groups)
         for axis in draws.axes:
@@ -154,7 +158,7 @@ def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
         if row.episode_id != _identity("episode", row.demo_sha256, replay, row.perturbations):
             raise PipelineError(
                 "the section replay has changed since the plan",
-                remedy=f"`{MAKE_AGAIN}`, which plans again; or put the section back",
+                remedy=f"run `{MAKE_AGAIN}`, which plans again; or restore the section",
             )
 
 

@@ -45,8 +45,8 @@ def _verdicts(
 ) -> Iterator[tuple[Row, Verdict | None]]:
     """Judge every row.
 
-    The twins, and each axis or combination, have a quota for each task. The most similar reserve replaces a wanted
-    candidate that fails. Perturbations that fail more often thus do not become rarer among kept episodes.
+    The clean twins, and each axis or combination, have a quota for each task. The most similar reserve replaces a
+    wanted candidate that fails. Perturbations that fail more often thus do not become rarer among kept episodes.
 
     Yields:
         Every row with its verdict; ``None`` for a row that, by the verdicts so far, is needed and is not replayed.

@@ -17,16 +17,16 @@ from pipeline.seeding import digest
 from pipeline.strict_yaml import StrictLoader
 
 OWNER = "configuration.json"
-"""File of a run's folder, its mark: states which configuration file the folder belongs to."""
+"""Mark of a run's folder: a file that states the configuration file of the folder."""
 
 PLACES = ("name", "folder", "compute")
-"""Fields of a configuration that state where a run is stored and computed. A folder that was moved has others."""
+"""Fields of a configuration that state where a run is stored and computed. Their values change with a moved folder."""
 
 PARAMS = Path("params.yaml")
-"""File that states which run `dvc repro` makes, and in which folder."""
+"""File that states the run of `dvc repro` and its folder."""
 
 LOCK = ".lock"
-"""Empty file of a run's folder that a stage holds while it runs."""
+"""Empty file of a run's folder that a stage locks while it runs."""
 
 
 class Mark(NamedTuple):
@@ -34,7 +34,7 @@ class Mark(NamedTuple):
 
     Attributes:
         file: absolute path of the configuration file.
-        content: digest of what the file states, without ``PLACES``; `None` in the mark of an earlier version.
+        content: digest of the file's fields, without ``PLACES``; `None` in the mark of an earlier version.
     """
 
     file: Path
@@ -42,7 +42,7 @@ class Mark(NamedTuple):
 
 
 def claimed(file: Path) -> Config:
-    """Load a configuration that is about to be run; its run's folder belongs to it from now on.
+    """Load a configuration for a run, and mark the run's folder as belonging to it.
 
     A stage deletes finished work that its plan does not name, so two configuration files must never share a folder.
     The folder's mark records the path of its configuration file, as seen from the folder, and a digest of its content.
@@ -73,9 +73,9 @@ def claimed(file: Path) -> Config:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other stages out of a run's folder, and delete what killed stages left in it.
+    """Keep other stages out of a run's folder, and delete the temporary files of killed stages in it.
 
-    The system ends the lock with this process, however the process ends.
+    The system releases the lock when this process ends for any reason.
 
     Raises:
         PipelineError: when another stage runs in the folder, or the file system has no locks.
@@ -87,15 +87,15 @@ def locked(folder: Path) -> Iterator[None]:
             raise PipelineError(
                 "another stage of this run is running, here or on another machine",
                 where=folder,
-                expected="one stage at a time, as each reads what the one before it has finished",
-                remedy=f"wait for it, or stop it; `{MAKE_AGAIN}` runs all stages in order",
+                expected="one stage at a time, as each stage reads the results of the stages before it",
+                remedy=f"wait for the other stage, or stop it; `{MAKE_AGAIN}` runs all stages in order",
             ) from error
         except OSError as error:  # Lustre, for example, can be mounted without locks.
             raise PipelineError(
                 f"the file system cannot lock a file ({error.strerror})",
                 where=folder,
-                expected="locks that hold on all machines that see the folder",
-                remedy="have it mounted with them (Lustre: -o flock), or set `folder:` to one that has them",
+                expected="a file system whose locks are valid on all machines that see the folder",
+                remedy="mount it with locks (Lustre: -o flock), or set `folder:` to a folder on another file system",
             ) from error
         remove_leftovers(folder)
         yield
@@ -114,14 +114,17 @@ def owned(file: Path) -> Run:
 
 
 def refuse_unmarked(folder: Path) -> None:
-    """Reject a folder that holds files and that no configuration has claimed, as the files are not of a run.
+    """Reject a folder with files that no configuration has claimed, as the files do not belong to a run.
 
     Raises:
         PipelineError: naming the folder and some of its files.
     """
     if folder.exists() and not folder.is_dir():
         raise PipelineError(
-            "not a folder", where=folder, expected="a new or empty folder", remedy="change `name:` or `folder:`"
+            "the path is not a folder",
+            where=folder,
+            expected="a new or empty folder",
+            remedy="change `name:` or `folder:`",
         )
     mark = folder / OWNER
     if not folder.exists() or mark.exists():
@@ -130,16 +133,17 @@ def refuse_unmarked(folder: Path) -> None:
     names = [entry.name for entry in folder.iterdir() if entry.name != LOCK and not is_temporary(entry.name, OWNER)]
     if names:
         raise PipelineError(
-            f"holds files and is not the folder of a run, as it has no {OWNER}: {', '.join(sorted(names)[:3])}",
+            f"the folder contains files and is not the folder of a run, as it has no {OWNER}: "
+            f"{', '.join(sorted(names)[:3])}",
             where=folder,
             expected="a new or empty folder, or the folder of this run",
-            remedy="change `name:` or `folder:`; if a run made these files and its mark is lost, write "
+            remedy="change `name:` or `folder:`; if a run generated these files and its mark is lost, write "
             f'{{"configuration": "configs/<name>.yaml"}} into {mark}',
         )
 
 
 def refuse_other_folder(file: Path) -> None:
-    """Reject a configuration whose folder is not that of params.yaml, where DVC would look for a stage's files.
+    """Reject a configuration whose folder differs from params.yaml, where DVC looks for the files of stages.
 
     Raises:
         PipelineError: naming both folders.
@@ -148,9 +152,9 @@ def refuse_other_folder(file: Path) -> None:
     chosen = yaml.safe_load(PARAMS.read_text()) if PARAMS.is_file() else None
     if isinstance(chosen, dict) and chosen.get("run") == file.stem and chosen.get("data") != config.folder.as_posix():
         raise PipelineError(
-            f"says `data: {chosen.get('data')}`, and {file} says `folder: {config.folder}`",
+            f"`data: {chosen.get('data')}` differs from `folder: {config.folder}` in {file}",
             where=PARAMS,
-            expected="the same folder in both",
+            expected="the same folder in both files",
             remedy=f"write `data: {config.folder}` into {PARAMS}",
         )
 
@@ -164,19 +168,19 @@ def _refuse_other_owner(config: Config, file: Path) -> None:
     if mark is None or mark.file == file.resolve():
         return
     this, owner = _shown(file.resolve(), mark.file)
-    adopt = f'to have the folder belong to {this}, write {{"configuration": "{this}"}} into {folder / OWNER}'
+    adopt = f'to assign the folder to {this}, write {{"configuration": "{this}"}} into {folder / OWNER}'
     if mark.file.exists():
         raise PipelineError(
             f"the folder belongs to {owner}, and {this} has the same name: {config.name}",
             where=folder,
-            expected="a folder for each configuration file, as a run deletes what it did not plan",
+            expected="a separate folder for each configuration file, as a run deletes files that it did not plan",
             remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
         )
     if mark.content != _content(file):
         raise PipelineError(
-            f"the folder belongs to {owner}, which is not there, and {this} has another content",
+            f"the folder belongs to {owner}, which is missing, and {this} has different content",
             where=folder,
-            expected="the content of the last run, where a folder or a configuration file was moved",
+            expected="the configuration of the last run, after a move of the folder or of the configuration file",
             remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
         )
 
@@ -185,9 +189,9 @@ def _refuse_folder_in_run(folder: Path) -> None:
     for parent in folder.resolve().parents:
         if (parent / OWNER).is_file() and (parent / LOCK).is_file():
             raise PipelineError(
-                f"is inside {parent}, the folder of another run",
+                f"the folder is inside {parent}, the folder of another run",
                 where=folder,
-                expected="folders of runs next to each other",
+                expected="a folder that is not inside the folder of another run",
                 remedy="change `folder:`",
             )
 
@@ -201,7 +205,7 @@ def _mark(folder: Path) -> Mark | None:
     path = folder / OWNER
     if not path.exists():
         return None
-    remedy = f'write {{"configuration": "configs/<name>.yaml"}}, the file that the folder belongs to, into {path}'
+    remedy = f'write {{"configuration": "configs/<name>.yaml"}}, with the configuration file of the folder, into {path}'
     try:
         stored = read_json(path, remedy)
         content = stored.get("content")
@@ -210,7 +214,7 @@ def _mark(folder: Path) -> Mark | None:
         return Mark((base / str(stored["configuration"])).resolve(), content)
     except (PipelineError, KeyError) as error:
         raise PipelineError(
-            "cannot read which configuration the folder belongs to",
+            "the mark of the folder does not name a configuration file",
             where=path,
             expected='a JSON object with the field "configuration"',
             remedy=remedy,
@@ -218,7 +222,7 @@ def _mark(folder: Path) -> Mark | None:
 
 
 def _content(file: Path) -> str:
-    """Return a digest of what a valid configuration file states, without ``PLACES``."""
+    """Return a digest of the fields of a valid configuration file, without ``PLACES``."""
     fields = yaml.load(file.read_text(encoding="utf-8"), StrictLoader)
     return digest({name: value for name, value in fields.items() if name not in PLACES})
 
@@ -227,10 +231,10 @@ def _refuse_links(folder: Path) -> None:
     links = [entry for entry in folder.iterdir() if entry.is_symlink()]
     if links:
         raise PipelineError(
-            "is a symbolic link",
+            "the entry of the run's folder is a symbolic link",
             where=links[0],
-            expected="the run's own files and folders, as a stage deletes what it did not plan",
-            remedy=f"put what it leads to in its place; {folder} as a whole may be a link to another disk",
+            expected="real files and folders, as a stage deletes files that it did not plan",
+            remedy=f"replace the link by its target; {folder} as a whole may be a link to another disk",
         )
 
 

@@ -54,28 +54,28 @@ def _datasets(group: str) -> Part:
 
 
 PARTS = {
-    "unfinished": Part((WORK,), "nothing: what stopped stages left"),
+    "unfinished": Part((WORK,), "no stage (unfinished files of stopped stages)"),
     "pictures": Part((SHEETS, PREVIEWS, REPORT), "summary and report"),
     "uploads": Part((CARD, FINETUNE), "card and recipe"),
     **{group: _datasets(group) for group in GROUPS},
-    "frames": Part((FRAMES,), "render, from the trajectories: most of a run's time"),
+    "frames": Part((FRAMES,), "render, from the trajectories (most of a run's time)"),
     "trajectories": Part((TRAJECTORIES, REPLAY), "replay, from the demonstrations"),
     "tables": Part(
         (PLAN, DATASETS, MANIFEST, COUNTS, STATISTICS, LEAKAGE, VALIDATION, INPUTS, SETTINGS, FINISHED),
-        "plan, manifest, validate and others",
+        "plan, manifest, validate and other stages",
     ),
 }
-"""Name to part; the part that takes the least work to generate again comes first."""
+"""Name to part. The parts are in the order of the work to generate them again, least work first."""
 
 
 def say_stale(part: str, run: Run) -> None:
-    """Print which datasets of a part of ``PARTS`` exist although the configuration does not ask for them."""
+    """Print the datasets of a part of ``PARTS`` that exist although the configuration does not request them."""
     asked = {dataset.folder for dataset in (*run.formats, *run.failure_formats)}
     for folder in map(run.path, PARTS[part].names):
         if folder.is_dir() and folder not in asked:
             print(
-                f"{folder} is of an earlier run, and not asked for: `python -m pipeline clean --only {part} CONFIG` "
-                f"deletes all of {part}, and the next run makes again what is asked for"
+                f"{folder} is from an earlier run and not requested; it stays until `python -m pipeline clean --only "
+                f"{part} CONFIG` deletes all datasets of {part}, of which a run generates the requested ones again"
             )
 
 

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Rows = Sequence[Mapping[str, Any]]
 """Rows of the manifest."""
 
+LONGEST_LINE = 40
+"""Largest width of the counts of all suites in one line of the table, which leaves room for the other columns."""
+
 
 @dataclass(frozen=True)
 class Counts:
@@ -164,21 +167,29 @@ def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
     Args:
         episodes: ``plan.episodes``.
     """
+    from rich import box
     from rich.table import Table
 
     suites, axes = named(rows, "suite"), named(tried(rows), "axis")
-    heads = [suite.replace("_", "_\n", 1) for suite in suites]  # Two lines fit into 80 columns.
+    heads = [suite.replace("_", "_\n", 1) for suite in suites]
     target_of = targets(rows, episodes)
-    table = Table("axis", *heads, "all", "wanted", title="planned/replayed/kept episodes")
-    for column in table.columns[1:]:
-        column.justify, column.no_wrap = "right", True
+    wanted = sum(target.wanted for target in target_of.values())
+    totals = [Counts.of(rows, suite=suite) for suite in suites]
+    # A cell with large numbers has three lines, and the name of a combination has a line for each axis. All columns
+    # then fit into 80 columns.
+    in_lines = len(suites) * (max(map(len, map(str, totals)), default=0) + 2) > LONGEST_LINE
+    table = Table("axis", title="planned/replayed/kept episodes", box=box.SIMPLE, pad_edge=False)
+    for head in (*heads, "all", "wanted"):
+        table.add_column(head, justify="right", no_wrap=True)
     for axis in axes:
         cells = [Counts.of(rows, axis=axis, suite=suite) for suite in suites]
         in_all = Counts.of(rows, axis=axis)
-        # The name of a combination may break after a +.
-        table.add_row(axis.replace("+", "+ "), *map(str, cells), str(in_all), str(target_of[axis].wanted))
-    wanted = sum(target.wanted for target in target_of.values())
-    totals = [Counts.of(rows, suite=suite) for suite in suites]
+        table.add_row(axis.replace("+", "+\n"), *_cells([*cells, in_all], in_lines), str(target_of[axis].wanted))
     table.add_section()
-    table.add_row("all", *map(str, totals), str(Counts.of(rows)), str(wanted))
+    table.add_row("all", *_cells([*totals, Counts.of(rows)], in_lines), str(wanted))
     return table
+
+
+def _cells(counts: Sequence[Counts], in_lines: bool) -> list[str]:
+    """Format counts for a table, in one line or in three lines."""
+    return [str(count).replace("/", "/\n") if in_lines else str(count) for count in counts]

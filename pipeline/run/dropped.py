@@ -105,7 +105,7 @@ def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
 
 
 def refuse_deletion(rows: Sequence[plan.Row], run: Run) -> None:
-    """Print how much finished work a plan drops, and stop if it is much and nobody allowed the deletion.
+    """Print the amount of finished work that a plan drops, and stop if it is large and the deletion is not allowed.
 
     Raises:
         PipelineError: when the share is above ``LARGEST_SHARE`` and ``REMAKE=1`` is not set. Nothing was changed.
@@ -113,14 +113,14 @@ def refuse_deletion(rows: Sequence[plan.Row], run: Run) -> None:
     dropped = measure(rows, run)
     if dropped.asks and os.environ.get(REMAKE) != "1":
         raise PipelineError(
-            f"the configuration no longer needs, and the run would delete: {dropped}",
+            f"the run would delete finished work that the configuration no longer needs: {dropped}",
             where=run.folder,
             expected=f"a configuration that needs all but {LARGEST_SHARE:.0%} of the finished work",
-            remedy=f"put the configuration back; or copy it to a file with another `name:`, which gets a folder of its "
-            f"own; or allow it: {ALLOW}",
+            remedy="restore the former configuration; or copy the new one to a file with another `name:`, which gets "
+            f"its own folder; or allow the deletion: {ALLOW}",
         )
     if dropped:
-        print(f"no longer needed, and deleted by the stages that follow: {dropped}")
+        print(f"later stages delete finished work that is no longer needed: {dropped}")
 
 
 def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str, str]]]:

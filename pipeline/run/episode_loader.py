@@ -1,4 +1,4 @@
-"""Loader that joins the plan and the rendered streams to the Episode that a writer puts into a dataset."""
+"""Loader that joins the plan and the rendered streams to an ``Episode``, which a writer puts into a dataset."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -73,7 +73,7 @@ def _rows_by_id(plan_file: Edition) -> dict[str, plan.Row]:
 
 @lru_cache(maxsize=10_000)
 def _subtasks(trajectories: Path, trajectory_id: str, suite: str, task: str) -> tuple[Subtask, ...]:
-    """Return the subtasks of a trajectory; cached, as episodes share trajectories and come in no order."""
+    """Return the subtasks of a trajectory; cached, because episodes share trajectories and are loaded in any order."""
     from pipeline.physics.subtasks import subtasks  # Only episodes with subtasks need the simulator.
 
     return subtasks(TrajectoryStore(trajectories).load(trajectory_id), find_task(suite, task))

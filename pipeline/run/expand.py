@@ -1,8 +1,8 @@
-"""New demonstrations from old ones: other starts of the arm and other object poses, in LIBERO's own HDF5 layout.
+"""Expanded demonstrations, with other starts of the arm and other object poses, in LIBERO's own HDF5 layout.
 
-An expansion replaces the hub's 50 demonstrations of each task where the hub cannot be reached. It generates many
-demonstrations from the starter set's one human demonstration, with the planner and the replay of the datasets. They are
-marked as expanded wherever they are used.
+An expansion replaces the hub's 50 demonstrations of each task if the hub cannot be reached. It generates many
+demonstrations from the starter set's one human demonstration, with the planner and the replay of the datasets. All
+files and datasets mark them as expanded.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Scene, State, Task, Trajectory
 
 RESERVE = 2.0
-"""Share of candidates sampled in addition to the wanted ones: colliding poses are rejected, and some replays fail."""
+"""Share of additional candidates, as colliding poses are rejected and some replays fail."""
 
 START_NORM_RAD = (0.1, 0.2, 0.3, 0.4, 0.5)
 """Norms of the offsets of the arm's start, by level; by default larger for a demonstration than for an episode."""
@@ -52,7 +52,7 @@ APART_RAD, APART_M = 0.05, 0.005
 """Two demonstrations of a task are duplicates if their arms and all their objects start closer than this."""
 
 REPLAY = ReplayConfig(mode="auto", noops="keep", settle_steps=0)
-"""Replay settings that keep no-ops and do not settle first, as in LIBERO's files: their readers do both themselves."""
+"""Replay settings that keep no-ops and do not settle first, as in LIBERO's files. Readers of the files do both."""
 
 
 @dataclass
@@ -73,11 +73,11 @@ class Expansion:
 
 
 def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: int, workers: Workers) -> Expansion:
-    """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
+    """Generate ``per_task`` demonstrations of each task, and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
-    A candidate is kept if it reaches the goal, moves about as smoothly as the human and starts unlike the candidates
-    before it. Replays are stored in ``<out>/.replays``, so that a stopped expansion resumes. The files of an earlier
-    expansion are replaced, or deleted if a task gets no demonstration.
+    A candidate is kept if it reaches the goal, moves about as smoothly as the human, and has another start than the
+    candidates before it. Replays are stored in ``<out>/.replays``, so that a stopped expansion resumes. The files of an
+    earlier expansion are replaced, or deleted if a task gets no demonstration.
 
     Args:
         demos: demonstrations that the candidates perturb.
@@ -124,19 +124,19 @@ def _refuse_other_demonstrations(file: Path) -> None:
     expanded = hdf5.expanded(file)
     if not expanded or not all(expanded):
         raise PipelineError(
-            "holds demonstrations that no expansion made, and would be replaced",
+            "the file contains demonstrations that no expansion generated, and would be replaced",
             where=file,
-            expected="no file, or one of an earlier expansion",
+            expected="no file, or a file of an earlier expansion",
             remedy="expand into another folder",
         )
 
 
 def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
-    """Plan candidates for ``expand`` in which the arm, and the objects that the task moves, start elsewhere.
+    """Plan candidates for ``expand`` in which the arm, and the objects that the task moves, start at other places.
 
-    The arm starts elsewhere in every candidate. If the task moves an object, the object's pose changes too; if the
-    object stands on or in another one, the whole scene moves. If the task only opens or turns something, nothing but
-    the arm's start changes.
+    The arm's start differs in every candidate. If the task moves an object, the object's pose changes too. If this
+    object stands on or in another object, the whole scene moves. If the task only opens or turns a thing, only the
+    arm's start changes.
     """
     by_moved: dict[Literal["target", "scene"] | None, list[DemoEntry]] = defaultdict(list)
     for entry in demos.index().entries:
@@ -175,7 +175,7 @@ def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: Trajec
     for row in rows:
         task, before = find_task(row.suite, row.task), accepted[row.suite, row.task]
         motion, twin = _motion(store, row.trajectory_id, task), twins[row.demo_id]
-        # A twin over which workers were lost has no motion to compare with.
+        # A clean twin over which workers were lost has no motion to compare with.
         human = motion if reasons[twin] == LOST else _motion(store, twin, task)
         if any(motion.smoothness[name] > limit * human.smoothness[name] for name, limit in ROUGH.items()):
             faults[row.episode_id] = "not_smooth"

@@ -56,12 +56,12 @@ BEFORE = "before"
 
 
 def export_run(kind: type[AnyFormat], run: Run) -> None:
-    """Bring a run's dataset of one format up to date, and print what was done.
+    """Bring a run's dataset of one format up to date, and print the result.
 
-    A dataset that the configuration does not ask for stays as it is.
+    A dataset that the configuration does not request stays unchanged.
     """
     if kind.name not in run.config.export.formats:
-        print(f"{kind.title} is not asked for: export.{kind.name} is null")
+        print(f"{kind.title} is not requested: export.{kind.name} is null")
         return
     for target in (*run.formats, *run.failure_formats):
         if target.name == kind.name:
@@ -73,10 +73,10 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     if not episodes.ids and "outcome" in target.extras:
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
-        print(f"no replay missed its goal: nothing is in {target.folder}")
+        print(f"no replay missed its goal, so {target.folder} was not written")
         return
     if is_current(target, episodes):
-        print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
+        print(f"{target.folder} is up to date, with {len(episodes.ids)} episodes: see {target.record_file}")
         return
     refuse_unasked(outdated(target, episodes), target.folder)
     with run.workers() as workers:
@@ -107,10 +107,10 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
                 foreign.append(path)
     if foreign:
         raise PipelineError(
-            f"not of this run's {target.title}, and would be deleted ({len(foreign)} such)",
+            f"the entry is not of this run's {target.title} and would be deleted ({len(foreign)} such entries)",
             where=foreign[0],
             expected=f"only {', '.join(sorted(sets))}",
-            remedy=f"move it out of {target.folder}; to train on both, make a folder of links to them",
+            remedy=f"move it out of {target.folder}; to train on both, create a folder of links to both",
         )
 
 
@@ -123,8 +123,8 @@ def _files(folder: Path) -> list[Path]:
 def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     """Return the episodes of a dataset in the order they are written: the kept episodes of a run, or its failures.
 
-    If the format takes ``language``, the episodes have subtasks and rewrites. The rewrites are those that the run's
-    language axis may sample for the episode; without that axis, those of its default ranges.
+    If the format takes ``language``, the episodes have subtasks and rewrites: all rewrites that the run's language axis
+    may sample for the episode. Without this axis, its default ranges decide.
     """
     failures = "outcome" in target.extras
     rewrites: dict[str, tuple[str, ...]] | None = {} if target.language else None
@@ -143,12 +143,16 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
 
 @cache
 def wordings(axis: LanguageAxis | None, suite: str, task: str, axes: str) -> tuple[str, ...]:
-    """List the rewrites that a language axis may sample for an episode of these axes; `None`: with default ranges."""
+    """List the rewrites that a language axis may sample for an episode of these axes.
+
+    Args:
+        axis: `None` for the axis with default ranges.
+    """
     return (axis or LanguageAxis()).wordings(find_task(suite, task), axes.split("+"), benchmark.load())
 
 
 def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:
-    """Return everything that the bytes of a dataset depend on: what is requested are episodes and options."""
+    """Return everything that the bytes of a dataset depend on. Its request consists of episodes and options."""
     contents = [episode.content for episode in episodes.known.values()]
     identity = digest(
         "export",
@@ -181,11 +185,11 @@ def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
     basis = compute_basis(target, episodes)
     if record.matches(basis) or not record.same_request(basis):
         return Counter()
-    return Counter({f"files, made with {record.why_not(basis)}": len(record.files)})
+    return Counter({f"files, generated with {record.why_not(basis)}": len(record.files)})
 
 
 def is_current(target: AnyFormat, episodes: Episodes) -> bool:
-    """Return whether the dataset exists, is whole and has these episodes.
+    """Return whether the dataset exists, is complete and has these episodes.
 
     Every file must exist and be no younger than the record. If so, statistics that a client stored in the sets are
     removed.
@@ -199,11 +203,29 @@ def is_current(target: AnyFormat, episodes: Episodes) -> bool:
 
 def untouched(target: AnyFormat) -> bool:
     """Return whether all files of a finished dataset exist, and none has changed since it was recorded."""
+    return changed_file(target) is None
+
+
+def changed_file(target: AnyFormat) -> Path | None:
+    """Return a file of a finished dataset that is missing or has changed since it was recorded.
+
+    Returns:
+        The first such file; the record if it is missing or unreadable; `None` if all files are unchanged.
+    """
     try:
         recorded = target.record_file.stat().st_mtime_ns
-        return all((target.folder / name).stat().st_mtime_ns <= recorded for name in target.record().files)
+        names = target.record().files
     except (PipelineError, OSError):
-        return False
+        return target.record_file
+    for name in names:
+        file = target.folder / name
+        try:
+            unchanged = file.stat().st_mtime_ns <= recorded
+        except OSError:
+            unchanged = False
+        if not unchanged:
+            return file
+    return None
 
 
 def list_records(run: Run) -> None:
@@ -243,8 +265,8 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         workers: get one call for each piece.
 
     Raises:
-        PipelineError: when an episode breaks the schema or the ids are unfit. The earlier dataset stays; whole pieces
-            stay in the work folder.
+        PipelineError: when an episode breaks the schema or the ids are unfit. The earlier dataset stays, and finished
+            pieces stay in the work folder.
     """
     pieces, basis = target.pieces(episodes), compute_basis(target, episodes)
     work = target.work / basis.identity

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError
+from itertools import chain
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -20,9 +21,9 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
 from pipeline.formats.registry import FORMATS
-from pipeline.identity import RECIPES, made_with, versions
+from pipeline.identity import RECIPES, Step, made_with, versions
 from pipeline.record import Basis, Record
-from pipeline.run.export import untouched
+from pipeline.run.export import changed_file
 from pipeline.run.layout import (
     COUNTS,
     FINISHED,
@@ -59,14 +60,16 @@ class Memory:
     Attributes:
         data: folder of the run.
         stage: name of the stage.
-        basis: everything that the outputs depend on now; `None` if an input has changed since it was recorded.
+        basis: everything that the outputs depend on now; `None` if it cannot be determined.
         outputs: files or folders of ``data``.
+        fault: reason why the basis cannot be determined; empty if it can.
     """
 
     data: Path
     stage: str
     basis: Basis | None
     outputs: Sequence[str]
+    fault: str = ""
 
     def holds(self) -> bool:
         """Return whether the outputs are unchanged, and were generated from the same inputs by the same recipe."""
@@ -75,7 +78,7 @@ class Memory:
     def why_not(self) -> str | None:
         """Describe why the stage has to work; `None` if the outputs are up to date."""
         if self.basis is None:
-            return "an input is missing or has changed"
+            return self.fault
         try:
             record = self._read()
         except (PipelineError, OSError, LookupError, TypeError, ValueError):
@@ -83,7 +86,7 @@ class Memory:
         outputs = self._contents()
         if record.matches(self.basis) and record.files != outputs:
             changed = sorted(name for name, _ in record.files.items() ^ outputs.items())
-            return f"{changed[0]} is missing or has changed"
+            return missing_or_changed(self.data / changed[0], self.data)
         return record.why_not(self.basis)
 
     def keep(self) -> None:
@@ -102,6 +105,11 @@ class Memory:
 
     def _contents(self) -> Mapping[str, str]:
         return _contents([self.data / name for name in self.outputs], self.data)
+
+
+def missing_or_changed(file: Path, data: Path) -> str:
+    """Describe the state of a file of a run's folder ``data`` that is not as it was recorded."""
+    return f"{file.relative_to(data).as_posix()} {'has changed' if file.exists() else 'is missing'}"
 
 
 def stage_memory(
@@ -123,7 +131,7 @@ def stage_memory(
             made_with_all.update(kind.made_with())
     except (PipelineError, PackageNotFoundError):
         # The stage `doctor` reports the fault.
-        return Memory(run.folder, name, None, outputs)
+        return Memory(run.folder, name, None, outputs, "a package is missing, or another copy of it is imported")
     made_with_all["code"] = library()[:16]
     contents = _contents([run.path(file) for file in inputs], run.folder)
     basis = Basis.of({"settings": dict(settings), "files": contents}, made_with_all)
@@ -139,13 +147,13 @@ def library() -> str:
 
 
 def validate_memory(run: Run) -> Memory:
-    """Return the memory of ``validate``: it passed on these contents, and nothing has changed since."""
+    """Return the memory of ``validate``, which passed on the recorded contents."""
     stores, formats = (run.trajectories, run.frames), run.recorded_formats
     files = [run.path(name) for name in (PLAN, MANIFEST, COUNTS, STATISTICS, INPUTS)]
     files += [store.root / TABLE for store in stores]
     files += [dataset.record_file for dataset in formats]
-    stores_whole = all(store.untouched() for store in stores)
-    whole = stores_whole and all(untouched(dataset) for dataset in formats)
+    changes = chain((store.changed_file() for store in stores), map(changed_file, formats))
+    changed = next(filter(None, changes), None)
     config = run.config
     settings = {
         "render": settings_of(config.render),
@@ -154,8 +162,7 @@ def validate_memory(run: Run) -> Memory:
         "bank of rewrites": checksum(BANK_FILE),
     }
     requested = {"settings": settings, "files": _contents(files, run.folder)}
-    basis = Basis.of(requested, made_with("checks")) if whole else None
-    return Memory(run.folder, "validate", basis, [VALIDATION])
+    return _memory(run, "validate", [VALIDATION], requested, "checks", changed)
 
 
 def trial_memory(run: Run, device: str) -> Memory:
@@ -179,7 +186,7 @@ def summary_memory(run: Run) -> Memory:
 
 
 def previews_memory(run: Run) -> Memory:
-    """Return the memory of the previews, which show no episode and so do not depend on kept or exported episodes."""
+    """Return the memory of the previews, which show no episode and do not depend on kept or exported episodes."""
     return _pictures_memory(run, "previews", [PREVIEWS], _drawn_by(run.config), [INPUTS])
 
 
@@ -196,9 +203,24 @@ def report_memory(run: Run) -> Memory:
 def _pictures_memory(
     run: Run, stage: str, outputs: Sequence[str], settings: Mapping[str, object], names: Sequence[str]
 ) -> Memory:
-    whole = FRAMES_TABLE not in names or run.frames.untouched()
+    changed = run.frames.changed_file() if FRAMES_TABLE in names else None
     requested = {"settings": settings, "files": _contents([run.path(name) for name in names], run.folder)}
-    return Memory(run.folder, stage, Basis.of(requested, made_with("pictures")) if whole else None, outputs)
+    return _memory(run, stage, outputs, requested, "pictures", changed)
+
+
+def _memory(
+    run: Run, stage: str, outputs: Sequence[str], requested: object, step: Step, changed: Path | None
+) -> Memory:
+    """Return a memory that does not hold if a stored file was changed or deleted.
+
+    Args:
+        requested: settings and input files that the outputs depend on, JSON-serialisable.
+        step: step of ``pipeline/identity.py`` that the outputs depend on.
+        changed: a stored file that was changed or deleted.
+    """
+    if changed is not None:
+        return Memory(run.folder, stage, None, outputs, missing_or_changed(changed, run.folder))
+    return Memory(run.folder, stage, Basis.of(requested, made_with(step)), outputs)
 
 
 def _drawn_by(config: Config) -> dict[str, object]:

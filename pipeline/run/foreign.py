@@ -55,10 +55,10 @@ def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) ->
         names = ", ".join(path.relative_to(data).as_posix() for path in foreign[:SHOWN])
         more = f" and {len(foreign) - SHOWN} more" if len(foreign) > SHOWN else ""
         raise PipelineError(
-            f"holds files that no stage of this run made, and that would be deleted: {names}{more}",
+            f"the folder contains files that no stage of this run generated, and that would be deleted: {names}{more}",
             where=data,
             expected=f"only the run's own files in {', '.join(MADE)}",
-            remedy="move these files out of these folders; files next to these folders stay as they are",
+            remedy="move these files to another folder; files next to the listed folders are never deleted",
         )
 
 

@@ -1,4 +1,4 @@
-"""Inputs of a run that DVC cannot read off a configuration: its defaults, and the content of the files that it names.
+"""Inputs of a run that DVC does not find in a configuration: its defaults, and the content of the files that it names.
 
 These files are demonstrations, the user's own tasks, a bank of rewrites, folders of textures and objects. A stage
 writes out the configuration and lists these files each time, and other stages depend on both. A changed file is
@@ -44,7 +44,7 @@ def listing(config: Config) -> dict[str, list[str | int]]:
 
 
 def settings(config: Config) -> dict[str, Any]:
-    """Return this machine and every section that decides what is generated, with all fields.
+    """Return this machine and every section that affects the generated files, with all fields.
 
     Paths are reduced to their last name, as ``listing`` lists their files.
     """

@@ -27,7 +27,7 @@ SPEED = f"{FINISHED}/speed.json"
 """File of a run's folder with the speed of the machine, from which ``status`` estimates the remaining time."""
 
 STORES = {"ten steps": (TRAJECTORIES, FRAMES), "one frame": (FRAMES,)}
-"""Map of each part of a trial to the folders whose files it stands for."""
+"""Map of each part of a trial to the folders whose files it represents."""
 
 TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
 """Task and number of control steps that a trial simulates and renders."""
@@ -93,7 +93,7 @@ def trial() -> Trial:
 def _seconds(call: Callable[[], object], gpu: bool = False) -> float:
     """Return the time of the quickest of ten calls, in s.
 
-    It is processor time, so that other work counts little; for a GPU it is wall-clock time.
+    For a processor it is processor time, on which other work has little effect. For a GPU it is wall-clock time.
     """
     timer = time.perf_counter if gpu else time.process_time
     return min(timeit.repeat(call, number=1, repeat=10, timer=timer))
@@ -136,10 +136,11 @@ def refuse_another(run: Run, trial: Mapping[str, str]) -> None:
         files_exist = any(next(run.path(store).rglob(f"*{SUFFIX}"), None) for store in stores)
         if recorded.get(name, digest) != digest and files_exist:
             raise PipelineError(
-                f"the run was begun where {name} came to {recorded[name]}, here it is {digest}",
+                f"the trial ({name}) gave {recorded[name]} on the machine that began the run, and gives {digest} here",
                 where=run.path(MACHINE),
-                expected="the same results of the same versions on the same OpenGL device",
-                remedy="go on where it was begun, or move away its " + " and its ".join(stores),
+                expected="equal results of equal versions on the same OpenGL device",
+                remedy="resume on the machine that began the run, or move the folders "
+                f"{' and '.join(stores)} to another place",
             )
 
 

@@ -36,30 +36,31 @@ class Result:
     kept: Annotated[bool, "in the datasets"]
     reason: Annotated[
         str,
-        "kept, or why not: goal_not_reached, goal_lost, too_short, simulation_unstable, scene_refused, state_mismatch, "
-        "worker_lost, no_reference, too_dark, blown_out, task_object_not_seen, hand_not_seen, added_objects_not_seen, "
-        "what a physics perturbation was refused for, the figure that `filter` refuses, not_replayed, "
-        "reserve_not_needed, left_out (export.where names others)",
+        "kept, or the reason for dropping; of the replay: goal_not_reached, goal_lost, too_short, simulation_unstable, "
+        "scene_refused, state_mismatch, worker_lost, no_reference, not_replayed, the reason of a rejected physics "
+        "perturbation, or the column beyond a limit of `filter`; of the frames: too_dark, blown_out, "
+        "task_object_not_seen, hand_not_seen, added_objects_not_seen, worker_lost; of the selection: "
+        "reserve_not_needed, left_out (by export.where)",
     ]
-    chosen: Annotated[bool, "of what export.where names; true where it is not set"]
+    chosen: Annotated[bool, "true if export.where selects the episode, or is not set"]
     replay_mode: Annotated[
-        str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"
+        str | None, "open_loop or tracked: method that produced the executed actions; null when not replayed"
     ]
     steps: Annotated[int | None, "executed actions (episode length), null when not replayed"]
     exceeds_step_limit: Annotated[
         bool | None,
         "steps above the limit at which an evaluation of the suite ends (220 spatial, 280 object, 300 goal, 520 long, "
-        "400 libero_90); null where not replayed, and for suites of one's own",
+        "400 libero_90); null when not replayed, and for the user's own suites",
     ]
     resolved: Annotated[
         str | None,
-        "JSON of what physics perturbations came to in the scene, by axis, or under fault why the demonstration could "
-        "not be simulated; null when not replayed",
+        "JSON of the results of physics perturbations in the scene, by axis, or under fault the reason of a failed "
+        "simulation; null when not replayed",
     ]
     path_ratio: Annotated[
-        float | None, "path_m by that of the clean twin; null where one of them did not reach the goal"
+        float | None, "path_m divided by path_m of the clean twin; null if one of them did not reach the goal"
     ]
-    gl_device: Annotated[str | None, "what rendered the frames, as OpenGL names it; null when not rendered"]
+    gl_device: Annotated[str | None, "OpenGL name of the device that rendered the frames; null when not rendered"]
 
 
 class Settings(Frozen):
@@ -171,9 +172,9 @@ def settings(path: Path) -> Settings:
         return Settings.model_validate_json(stored.metadata[_SETTINGS])
     except (OSError, pa.ArrowException, TypeError, KeyError, ValidationError) as error:
         raise PipelineError(
-            f"not a manifest of this version ({error})",
+            f"the file is not a manifest of this version ({error})",
             where=path,
-            expected="the columns of schemas/manifest.json, and the settings that its episodes were made under",
+            expected="the columns of schemas/manifest.json, and the settings that generated its episodes",
             remedy=MAKE_AGAIN,
         ) from error
 

@@ -134,7 +134,7 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
 
 
 def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
-    """List the failures that ``export`` asks for, by the verdicts of ``selection.select``."""
+    """List the failures that ``export`` requests, by the verdicts of ``selection.select``."""
     if not export.failures:
         return []
     failures = [row for row in rows if judged[row.episode_id].reason in MISSED]
@@ -153,9 +153,9 @@ def rendered(row: plan.Row, frames: Mapping[str, StoredFrames]) -> bool:
 def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
     if missing:
         raise PipelineError(
-            f"what the plan needs is missing, damaged or not current in {len(missing)} places, such as this one",
+            f"{len(missing)} files or folders that the plan needs are missing, damaged or outdated, such as this one",
             where=missing[0],
-            remedy=f"`{MAKE_AGAIN}`, or python stages/{stage}.py CONFIG: makes only those",
+            remedy=f"run `{MAKE_AGAIN}`, or `python stages/{stage}.py CONFIG` for this stage alone",
         )
 
 
@@ -166,7 +166,7 @@ def outdated(
 
     The count includes finished files of today's plan, with today's settings, that were generated with other recipes,
     packages, machine code or another OpenGL device: see ``identity.refuse_unasked``. Files that a changed
-    configuration or plan replaces are not counted: ``dropped.refuse_deletion`` asks about them.
+    configuration or plan replaces are not counted: ``dropped.refuse_deletion`` reports them.
 
     Args:
         device: OpenGL name of the device that renders here; without it, frames of any device count as finished.
@@ -179,5 +179,5 @@ def outdated(
     numbers: Counter[str] = Counter()
     for kind, reasons in by_kind.items():
         for reason, number in reasons.items():
-            numbers[f"{kind}, made with {reason}"] += number
+            numbers[f"{kind}, generated with {reason}"] += number
     return numbers

@@ -38,9 +38,9 @@ def is_up_to_date(run: Run) -> bool:
 
 
 def upcoming(run: Run) -> Sequence[plan.Row]:
-    """Return the plan that a run would have: its own if up to date, else another, made here and not written.
+    """Return the plan that a run would have: the stored plan if it is up to date, else a new plan, which is not stored.
 
-    If a run has neither a plan nor finished work, the result is empty, as making a plan may take a minute.
+    If a run has neither a plan nor finished work, the result is empty, as planning may take a minute.
 
     Raises:
         PipelineError: as of ``make``.

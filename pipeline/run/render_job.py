@@ -38,7 +38,7 @@ class RenderJob:
     device: str
 
     def __call__(self) -> None:
-        """Store the streams in one file: copy the streams that other files of the trajectory hold, render the rest.
+        """Store the streams in one file: copy the streams of the trajectory's other files, and render the rest.
 
         Raises:
             PipelineError: when another device renders here: its pixels differ, and the run would never use them.
@@ -46,10 +46,11 @@ class RenderJob:
         device = gl.choose().device
         if device != self.device:
             raise PipelineError(
-                f"this worker renders with {device}, the run with {self.device}",
+                f"this worker renders with {device}, but the run renders with {self.device}",
                 where=f"worker on {platform.node()}",
-                expected="one device for all frames of a run, as devices differ by some grey levels",
-                remedy="start the stage and every worker on machines that render alike (MUJOCO_GL picks the back end)",
+                expected="the same device for all frames of a run, as devices differ by some grey levels",
+                remedy="start the stage and every worker on machines with the same OpenGL device (MUJOCO_GL selects "
+                "the back end)",
             )
         trajectory = self._trajectory()
         parts, missing = self._stored()
@@ -83,7 +84,7 @@ class RenderJob:
         return TrajectoryStore(self.trajectories).load(self.row.trajectory_id)
 
     def _stored(self) -> tuple[list[Rendered], list[Stream]]:
-        """Read the streams that files hold, and list the streams that no file holds."""
+        """Read the stored streams, and list the streams that are not stored."""
         wanted = {stream.stream_id: stream.geometry.stream_id for stream in self.streams}
         parts = FrameStore(self.frames, self.render_config).stored(self.row.trajectory_id, wanted, self.device)
         held: set[str] = set()

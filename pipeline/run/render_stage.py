@@ -55,13 +55,13 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
 def render_plan(
     rows: Sequence[Row], config: Config, trajectories: TrajectoryStore, frames: FrameStore, workers: Workers
 ) -> set[str]:
-    """Render the streams that ``frames`` lacks of every kept episode, and of failures if the configuration asks.
+    """Render the missing streams of every kept episode, and of failures if the configuration requests them.
 
     Reserves replace episodes with rejected frames. Rendering therefore repeats until it has generated all files that it
     can from the stored trajectories.
 
     Returns:
-        The files of ``frames`` that the plan needs. They do not depend on what was rendered before.
+        The files of ``frames`` that the plan needs. They do not depend on earlier renderings.
 
     Raises:
         PipelineError: when rendering leaves the same work undone.
@@ -79,9 +79,9 @@ def render_plan(
             return set(needed)
         if missing.keys() == undone:
             raise PipelineError(
-                f"{len(missing)} files of frames were rendered and are still not there, such as this one",
+                f"{len(missing)} files of frames were rendered and are still missing, such as this one",
                 where=frames.path(next(iter(missing))),
-                expected=f"files written there by workers, rendered on {device}",
+                expected=f"files that workers write to this folder, rendered on {device}",
                 remedy="check that all workers see this folder and have the same versions and OpenGL device",
             )
         undone = set(missing)

@@ -1,4 +1,4 @@
-"""Job of a worker that makes one replay: read the demonstration, replay and judge it, store the trajectory."""
+"""Job of a worker that computes one replay: read the demonstration, replay and judge it, store the trajectory."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -27,7 +27,7 @@ class ReplayJob:
 
     Attributes:
         row: a row of the plan that has this trajectory.
-        twin: id of the trajectory of the same demonstration without perturbations, which tracking follows.
+        twin: id of the clean twin's trajectory, which tracking follows.
     """
 
     row: Row
@@ -48,7 +48,7 @@ class ReplayJob:
                 "the demonstration has changed since the plan",
                 where=(self.demos.root or Path()) / demo.source,
                 expected=f"content with the hash {self.row.demo_sha256}",
-                remedy="put the file back, or run the plan stage again, which draws for what is there now",
+                remedy="restore the file, or run the plan stage again, which samples for the present content",
             )
         physics = of_layer(from_json(self.row.perturbations), PhysicsPerturbation)
         environment = shared(demo.task)
@@ -70,7 +70,7 @@ class ReplayJob:
         return trajectory.verdict
 
     def _reference(self, environment: Environment, demo: Demo) -> Reference | None:
-        """Return the reference that tracking follows: the twin if it reached its goal, else the recording."""
+        """Return the reference that tracking follows: the clean twin if it reached its goal, else the recording."""
         if self.twin != self.row.trajectory_id:
             twin = TrajectoryStore(self.folder).path(self.twin)
             reference = _twin(edition(twin))
@@ -95,7 +95,7 @@ class ReplayJob:
         trajectory = Trajectory(
             trajectory_id=self.row.trajectory_id,
             mode="open_loop",
-            scene=Scene("", np.zeros(1), {"fault": "workers ended in it, or it took too long"}),
+            scene=Scene("", np.zeros(1), {"fault": "workers ended during the replay, or it took too long"}),
             states=np.zeros((1, 1)),
             actions=np.empty((0, 7)),
             site_alpha=np.empty((1, 0), np.float32),
@@ -114,7 +114,7 @@ def _at_reset(environment: Environment, demo: Demo, seed: int) -> Demo:
 
 @lru_cache(maxsize=1)
 def _twin(file: Edition) -> Reference | None:
-    """Return the motion of a twin, `None` if it did not reach its goal."""
+    """Return the motion of a clean twin, `None` if it did not reach its goal."""
     return _followed(TrajectoryStore(file.path.parent).load(file.path.stem))
 
 

@@ -34,9 +34,9 @@ class Replays:
     limits: FilterConfig = NO_LIMITS
 
     def complete(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
-        """Replay what a plan needs and the store lacks; replay reserves only if a candidate failed.
+        """Replay the trajectories that a plan needs and the store lacks; replay reserves only if a candidate failed.
 
-        The twins come first, because tracking follows them.
+        The clean twins come first, because tracking follows them.
 
         Args:
             rejected: episode id to the reason why its frames were rejected, as far as frames were rendered.
@@ -77,8 +77,8 @@ class Replays:
 def _refuse_undone(files: Sequence[Path]) -> None:
     if files:
         raise PipelineError(
-            f"{len(files)} trajectories were replayed and are still not there, such as this one",
+            f"{len(files)} trajectories were replayed and are still missing, such as this one",
             where=files[0],
-            expected="files written there by workers",
+            expected="files that workers write to this folder",
             remedy="check that all workers see this folder and have the same versions",
         )

@@ -1,4 +1,4 @@
-"""A run: one configuration, and everything that is stored in its folder ``data/<run>``."""
+"""A run: one configuration, and the files in its folder ``data/<run>``."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -105,22 +105,22 @@ class Run:
 
     @property
     def formats(self) -> list[AnyFormat]:
-        """Datasets that the configuration asks for."""
+        """Datasets that the configuration requests."""
         return self.config.export.datasets(self.folder, self.config.render.extras)
 
     def dataset(self, name: str) -> AnyFormat:
-        """Return the dataset of a format that the configuration asks for, such as ``rlds``."""
+        """Return the dataset of a format that the configuration requests, such as ``rlds``."""
         (dataset,) = (dataset for dataset in self.formats if dataset.name == name)
         return dataset
 
     @property
     def failure_formats(self) -> list[AnyFormat]:
-        """Datasets of failures that the configuration asks for."""
+        """Datasets of failures that the configuration requests."""
         return self.config.export.failure_datasets(self.folder, self.config.render.extras)
 
     @property
     def recorded_formats(self) -> list[AnyFormat]:
-        """Datasets that the configuration asks for; datasets of failures only if they exist."""
+        """Datasets that the configuration requests; datasets of failures only if they exist."""
         recorded_failures = [dataset for dataset in self.failure_formats if dataset.record_file.exists()]
         return [*self.formats, *recorded_failures]
 

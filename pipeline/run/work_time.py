@@ -1,4 +1,4 @@
-"""Time that finished trajectories and frames took, or would take: measured figures, scaled to a machine's speed.
+"""Time of the generation of trajectories and frames: measured figures, scaled to a machine's speed.
 
 Times are CPU times of one core of the machine that ``REFERENCE`` describes. The times of frames are in
 ``libero/arenas.py``.
@@ -11,7 +11,7 @@ REFERENCE = Speed(step_s=0.0033, frame_s=0.093)
 """Speed of the machine of the figures below, by ``machine.trial``: one repeated step, and a frame without savings."""
 
 ENCODE_S = 0.004
-"""Time for a frame's JPEG, and its noise if it has some. A GPU does not make it quicker."""
+"""Time for a frame's JPEG, and for its noise if it has some. A GPU does not reduce it."""
 SCENE_S, STEP_S, TRIES = 2.2, 0.007, 1.4
 """Time for a trajectory without its control steps, time for a step, and runs of each step: tracking follows a replay
 that missed its goal."""

@@ -128,14 +128,14 @@ class FrameStore(Store):
             frames, views = frames - frames_of_file, views - views_of_file
         if frames or views or not parts:
             raise PipelineError(
-                f"streams {sorted(frames | views)} were not rendered",
+                f"the streams {sorted(frames | views)} are not rendered",
                 where=self.folder(trajectory_id),
                 remedy="run the render stage again",
             )
         return merged(parts)
 
     def stored(self, trajectory_id: str, streams: Mapping[str, str], device: str) -> list[Rendered]:
-        """Read what up-to-date files hold of the named streams of a trajectory, each stream once.
+        """Read the named streams of a trajectory, as far as up-to-date files have them, each stream once.
 
         Args:
             streams: id of a stream to the id of its geometry.
@@ -179,14 +179,18 @@ class FrameStore(Store):
             with self.opened(name) as file:
                 if _members(file, "streams"):
                     return file.array("action"), file.array("state")
-        raise PipelineError("not rendered", where=self.folder(trajectory_id), remedy="run the render stage again")
+        raise PipelineError(
+            "the trajectory has no rendered frames",
+            where=self.folder(trajectory_id),
+            remedy="run the render stage again",
+        )
 
     def _files_of(self, trajectory_id: str) -> list[str]:
         return sorted(f"{trajectory_id}/{path.stem}" for path in self.folder(trajectory_id).glob(f"*{SUFFIX}"))
 
 
 def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
-    """Return the name of the file that holds these streams of a trajectory, or states that they were rejected."""
+    """Return the name of the file with these streams of a trajectory, or with the reasons of their rejection."""
     return f"{trajectory_id}/{digest(*sorted(streams))[:16]}"
 
 
@@ -220,7 +224,7 @@ def merged(parts: Sequence[Rendered]) -> Rendered:
 
 
 def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[str]) -> Rendered:
-    """Read the named streams and geometry of a file, and all other values that it holds."""
+    """Read the named streams and geometry of a file, and all its other values."""
     quality = file.attributes["quality"]
     return Rendered(
         replay_mode=file.attributes["replay_mode"],

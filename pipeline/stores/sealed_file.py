@@ -23,7 +23,7 @@ _DAMAGE = (BadZipFile, EOFError, LookupError, RuntimeError, TypeError, ValueErro
 
 
 class BrokenSealError(Exception):
-    """Content of a file that differs from what was written."""
+    """Content of a file that has changed since it was written."""
 
 
 @contextmanager
@@ -44,14 +44,14 @@ class SealedFile:
         self.attributes: Mapping[str, Any] = header["attributes"]
         self.checksums: Mapping[str, str] = header["sha256"]
         if archive.namelist() != [*(f"{name}.npy" for name in self.checksums), HEADER]:
-            raise BrokenSealError("the list of its arrays is not what was written")
+            raise BrokenSealError("the list of its arrays has changed since it was written")
 
     @_damage_as_one_error()
     def array(self, name: str) -> NDArray[Any]:
         """Read one array and compare its checksum."""
         content = self._archive.read(f"{name}.npy")
         if sha256(content).hexdigest() != self.checksums[name]:
-            raise BrokenSealError(f"{name} is not what was written")
+            raise BrokenSealError(f"{name} has changed since it was written")
         values: NDArray[Any] = np.load(BytesIO(content), allow_pickle=False)
         return values
 
@@ -62,7 +62,7 @@ def unsealed(path: Path) -> Iterator[SealedFile]:
     with _damage_as_one_error():
         archive = ZipFile(path)
         if any(not 0 <= member.header_offset < path.stat().st_size for member in archive.infolist()):
-            raise BadZipFile("an array lies outside of the file")
+            raise BadZipFile("an array has a position outside of the file")
     with archive:
         yield SealedFile(archive)
 

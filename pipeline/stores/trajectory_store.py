@@ -22,8 +22,8 @@ class TrajectoryStore(Store):
     (number of executed actions). Further columns are ``resolved`` (JSON of the effects of physics perturbations in the
     scene) and those of ``Quality``.
 
-    A file holds no path of the machine. Its bytes therefore do not depend on where the packages are installed, and
-    every machine can read it.
+    A file contains no path of the machine. Its bytes therefore do not depend on the place of the packages, and every
+    machine can read it.
     """
 
     # The stage `render` generates missing trajectories too: it replays reserves.

@@ -4,19 +4,19 @@ import base64
 import ctypes.util
 import hashlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, PackagePath, distribution, metadata, requires, version
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from platform import python_version
+from textwrap import wrap
 from typing import Literal
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from pipeline import gl, origins
@@ -45,6 +45,11 @@ WORKER_GB = 3.5
 3.4 GB, in validate and summary."""
 
 Status = Literal["ok", "warn", "fail"]
+
+STYLES: dict[Status, str] = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+
+MIN_WIDTH = 20
+"""Least width of the results, in characters, in a narrow terminal."""
 
 
 @dataclass(frozen=True)
@@ -89,22 +94,33 @@ def run(run: Run, *, tried: bool = False) -> int:
     Returns:
         The exit status: 1 if a check fails, else 0.
     """
-    table = Table(box=None)
-    for column in ("", "what", "found", "try"):
-        table.add_column(column, overflow="fold")
-    styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
     # Finished files of a folder need no more space. Larger folders, such as a former dataset, do not reduce the need
     # of the others.
     left_mb = (max(0.0, mb - size_mb(run.path(folder))) for folder, mb in needed_mb(run.config).items())
     findings = check(run, max(sum(left_mb), RUN_MB) / 1e3)
     if all(finding.status != "fail" for finding in findings):
         findings += _tried(run, tried)
-    for finding in findings:
-        # Text objects, because rich would read square brackets in a string as markup.
-        cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
-        table.add_row(Text(finding.status, style=styles[finding.status]), *cells)
-    Console(stderr=True, highlight=False).print(table)
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print(_in_lines(findings, console.width))
     return int(any(finding.status == "fail" for finding in findings))
+
+
+def _in_lines(findings: Sequence[Diagnosis], width: int) -> Text:
+    """Format results as lines of at most ``width`` characters: status, name and result, with the remedy below.
+
+    No word is broken, so that paths and commands can be copied. A word that is too long exceeds the width.
+    """
+    indent = len("warn  ") + max(len(finding.name) for finding in findings) + 2
+    text = Text()
+    for finding in findings:
+        remedy = f"try: {finding.remedy}" if finding.remedy else ""
+        lines: list[str] = []
+        for paragraph in (*finding.detail.splitlines(), *remedy.splitlines()):
+            lines += wrap(paragraph, max(width - indent, MIN_WIDTH), break_long_words=False, break_on_hyphens=False)
+        text.append(f"{finding.status:<6}", style=STYLES[finding.status])
+        text.append(f"{finding.name:<{indent - 6}}" + f"\n{'':{indent}}".join(lines) + "\n")
+    text.rstrip()
+    return text
 
 
 def _tried(run: Run, tried: bool) -> list[Diagnosis]:

@@ -296,7 +296,7 @@ def test_of_a_wording_in_both_banks_and_two_classes_the_first_counts(tmp_path: P
 def test_a_bank_with_a_task_given_twice_is_refused(tmp_path: Path) -> None:
     bank = tmp_path / "bank.yaml"
     bank.write_text("libero_goal:\n  stove: {paraphrase: []}\n  stove: {distraction: []}\n")
-    with pytest.raises(PipelineError, match="the key 'stove' is given twice"):
+    with pytest.raises(PipelineError, match="the key 'stove' is repeated"):
         load_bank(bank)
 
 

@@ -53,7 +53,7 @@ def main() -> None:
         with small_disk(disturbed / "data" / "tiny") as disk:
             for name in STAGES:
                 remount(disk, "ro")
-                faults += unlike_a_message(name, stage(disturbed, name), "cannot be written to")
+                faults += unlike_a_message(name, stage(disturbed, name), "file system is read-only")
                 refused["read_only"] += 1
                 remount(disk, "rw")
                 while (done := stage(disturbed, name)).returncode:

@@ -219,7 +219,7 @@ def test_errors_say_what_is_missing(data: Path, tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="no RLDS dataset"):
         check_all(tmp_path)
     (tmp_path / "rlds").symlink_to(data / "rlds")
-    with pytest.raises(PipelineError, match=r"dataset_statistics\.json: not there"):
+    with pytest.raises(PipelineError, match=r"dataset_statistics\.json: the file is missing"):
         check_all(tmp_path)
     (tmp_path / "dataset_statistics.json").write_text("{}")
     (found,) = check_all(tmp_path).values()

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -59,6 +60,24 @@ def test_every_command_is_listed_and_explains_itself(
             assert re.search(r"\n\n  [A-Z]\w+ .*", page), "the first sentence"
         else:
             assert re.search(rf"^  {command[-1]} +[A-Z]", page, re.MULTILINE), "its line in the list"
+
+
+@pytest.mark.parametrize("command", commands(), ids=" ".join)
+def test_every_help_page_has_an_example_that_the_command_takes(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "argv", ["pipeline", *command, "--help"])
+    assert main() == 0
+    page = capsys.readouterr().out
+    assert max(map(len, page.splitlines())) <= 80
+    examples = page.partition("  Example")[2].replace("\\\n", " ").splitlines()[1:]
+    assert examples
+    for line in examples:
+        program, words = line.split(None, 3)[:3], shlex.split(line)[3:]
+        assert program == ["python", "-m", "pipeline"]
+        assert tuple(words[: len(command)]) == command
+        parse(words)
 
 
 def test_a_moved_command_names_its_new_place(
@@ -171,9 +190,9 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path
         assert done.returncode == 0, done.stderr
         lines = [line.strip() for line in done.stdout.splitlines()]
         assert any(line.startswith("disk: ") and "GB free" in line for line in lines)
-        if "nothing would run: all of this configuration is made" in lines:
+        if "no stage would run: all datasets are finished" in lines:
             return []
-        told = [line.partition(":")[0] for line in lines[lines.index("would run:") + 1 :] if ": " in line]
+        told = [line.partition(":")[0] for line in lines[lines.index("stages that would run:") + 1 :] if ": " in line]
         assert told[-1] == "time left" or told[-2:] == ["plan", "disk"], "there is no estimate without a plan"
         return [line for line in told if line not in ("disk", "time left")]
 
@@ -191,33 +210,35 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path
     (clone / "card").rename(clone / "data/tiny/card")
     (clone / "data/tiny/leakage.json").write_text("{}")
     assert would_run() == ["leakage", "card", "report"]
-    assert "leakage: leakage.json is missing or has changed" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "leakage: leakage.json has changed" in call(clone, "status", "configs/tiny.yaml").stdout
     shutil.copy(finished / "leakage.json", clone / "data/tiny/leakage.json")
     demos = tiny_config(shutil.copytree(short_demos, clone / short_demos.name))["demos"]
     configured(clone, demos=demos)
     assert would_run() == [], "the place of the demonstrations changes nothing"
     (clone / short_demos.name / "another").write_text("")
-    assert would_run() == ["plan", "exports and all that follows"]
-    assert "plan: other demos.root/another" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert would_run() == ["plan", "exports and later stages"]
+    assert "plan: changed demos.root/another" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / short_demos.name / "another").unlink()
     configured(clone, export={"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 2}})
-    assert would_run() == ["doctor", "export_rlds", "manifest and all that follows"]
+    assert would_run() == ["doctor", "export_rlds", "manifest and later stages"]
     configured(clone, export=tiny_config(clone)["export"])
     rendered, *others = sorted((clone / "data/tiny/frames").glob("*/"))
     shutil.rmtree(rendered)
-    assert would_run() == ["render", "exports and all that follows"]
+    assert would_run() == ["render", "exports and later stages"]
     (clone / "data/tiny/trajectories" / f"{others[0].name}.npz").unlink()
-    assert would_run() == ["replay", "render", "exports and all that follows"]
+    assert would_run() == ["replay", "render", "exports and later stages"]
     configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
-    assert "plan: other plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "plan: changed plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
     (clone / "data/tiny/plan.parquet").unlink()
     told = call(clone, "status", "configs/tiny.yaml").stdout
     assert "  plan: " in told
-    assert re.search(r"no longer needed, and deleted by a run with REMAKE=1, without which it stops: \d+ traj", told)
+    assert re.search(
+        r"no longer needed: \d+ traj.*A run stops before it deletes this work, unless REMAKE=1 allows it", told
+    )
     for folder in ("trajectories", "frames"):
         shutil.rmtree(clone / "data/tiny" / folder)
     told = call(clone, "status", "configs/tiny.yaml").stdout
-    assert re.search(r"no longer needed, .*: \d+ episodes of the datasets", told), "they would be replaced"
+    assert re.search(r"no longer needed: \d+ episodes of the datasets", told), "they would be replaced"
     for record in ("rlds.json", "lerobot.json"):
         (clone / "data/tiny" / record).unlink()
     assert would_run() == ["plan"]
@@ -230,7 +251,7 @@ def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
     asked = call(clone, "clean", "configs/tiny.yaml", stdin=subprocess.DEVNULL)
     assert asked.returncode == 1
     assert "add --yes" in asked.stderr
-    assert "made again by export_rlds" in asked.stdout
+    assert "generated again by export_rlds" in asked.stdout
     assert set(data.rglob("*")) == files
     done = call(clone, "clean", "--only", "rlds", "--yes", "configs/tiny.yaml")
     assert done.returncode == 0, done.stderr
@@ -239,7 +260,7 @@ def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
     assert call(clone, "clean", "--yes", "configs/tiny.yaml").returncode == 0
     left = {file.name for file in data.iterdir()}
     assert left == {"notes.txt", "configuration.json", "machine.json", ".lock"}
-    assert "has nothing of this" in call(clone, "clean", "configs/tiny.yaml").stdout
+    assert "has no files of these parts" in call(clone, "clean", "configs/tiny.yaml").stdout
 
 
 @dataclass
@@ -314,7 +335,7 @@ def test_run_elsewhere_with_a_subset_in_one_format(ablation: Ablation) -> None:
     recipe = yaml.safe_load((data / "finetune/finetune.yaml").read_text())
     assert tuple(recipe["clients"]) == Rlds.clients
     assert [entry.name for entry in (data / "card").iterdir() if entry.is_dir()] == ["rlds"]
-    assert "nothing would run" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "no stage would run" in call(clone, "status", "configs/tiny.yaml").stdout
 
     found = call(clone, "dataset", "check", "configs/tiny.yaml")
     assert found.returncode == 0, found.stdout + found.stderr

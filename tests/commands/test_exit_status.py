@@ -71,7 +71,7 @@ def test_a_signal_stops_it_in_order(number: signal.Signals, status: int) -> None
     waiting.send_signal(number)
     out, err = waiting.communicate(timeout=20)
     assert (waiting.returncode, out) == (status, "closed\n")
-    assert err == "stopped; run the same command again: what is finished is kept\n"
+    assert err == "stopped; run the same command again, which keeps finished work\n"
 
 
 @pytest.mark.slow

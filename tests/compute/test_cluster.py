@@ -156,7 +156,7 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     assert f"does not see {folder}" in message
     assert "has code of pipeline " in message
     assert "runs 2 threads" in message
-    assert re.search(r"has machine code Sandybridge \w+, the run has Haswell AVX2", message)
+    assert re.search(r"has machine code Sandybridge \w+, but the run has Haswell AVX2", message)
     assert f'OPENBLAS_CORETYPE="{MACHINE_CODE_VARIABLES["OPENBLAS_CORETYPE"]}"' in message
     assert "dask worker ADDRESS --nthreads 1" in message
     assert not list((tmp_path / "elsewhere").rglob("data"))
@@ -166,7 +166,7 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     # As a worker finds out that joins when the work is under way.
     with (
         Client(address) as client,
-        pytest.raises(PipelineError, match=r"does not see .* has Python 3\.\d+\.\d+, the run has 2"),
+        pytest.raises(PipelineError, match=r"does not see .* has Python 3\.\d+\.\d+, but the run has 2"),
     ):
         client.submit(Workplace(Path.cwd(), folder / "token", {"Python": "2"}).enter).result()
 
@@ -220,6 +220,6 @@ def test_workers_have_all_that_files_are_made_with() -> None:
 def test_replays_that_workers_leave_undone_are_named(tmp_path: Path) -> None:
     demos = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
     rows = plan.make(demos.index().entries, CLEAN, ReplayConfig(), NONE)
-    with pytest.raises(PipelineError, match="1 trajectories were replayed and are still not there") as caught:
+    with pytest.raises(PipelineError, match="1 trajectories were replayed and are still missing") as caught:
         Replays(demos, ReplayConfig(), TrajectoryStore(tmp_path), lambda work, jobs, what: []).complete(rows)
     assert f"{rows[0].trajectory_id}.npz" in str(caught.value)

@@ -198,7 +198,7 @@ def test_a_job_has_the_memory_that_the_stages_were_measured_to_take() -> None:
     ("compute", "expected"),
     [
         ({"cluster": "slurm"}, "needs a number of workers"),
-        ({"cluster": "local", "slurm": {}}, "goes with cluster: slurm"),
+        ({"cluster": "local", "slurm": {}}, "slurm requires cluster: slurm"),
         ({"cluster": "slurm", "workers": 2, "slurm": {"queue": "cpu"}}, "queue"),
     ],
 )

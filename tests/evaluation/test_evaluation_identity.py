@@ -255,7 +255,7 @@ def test_a_perturbation_that_is_drawn_otherwise_now_is_run_again(
     assert select(chosen) == tasks
     changed = sum(replayed.result(task) is None for task in tasks)
     assert 0 < changed < len(tasks), "of one component alone"
-    with pytest.raises(PipelineError, match=rf"anew: {changed} episodes, generated with other draws\n"):
+    with pytest.raises(PipelineError, match=rf"again: {changed} episodes, generated with other draws\n"):
         replayed.check(tasks)
 
 

@@ -49,10 +49,12 @@ def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatc
     """Not one by pip, which may change other packages that are pinned."""
     with monkeypatch.context() as context:
         context.setattr("pipeline.libero.demonstrations.package_folder", lambda _: tmp_path)
-        with pytest.raises(PipelineError, match=r"no starter demonstration of (?s:.*)try: rm -rf \.venv && bash setup"):
+        with pytest.raises(
+            PipelineError, match=r"no starter demonstration of (?s:.*)try: mv \.venv \.venv\.old && bash setup"
+        ):
             StarterSource().index([TASK])
     monkeypatch.setattr("pipeline.libero.assets.find_spec", lambda _: None)
-    with pytest.raises(PipelineError, match=r"robouse is not installed\n  try: rm -rf \.venv && bash setup"):
+    with pytest.raises(PipelineError, match=r"robouse is not installed\n  try: mv \.venv \.venv\.old && bash setup"):
         StarterSource().index([TASK])
 
 

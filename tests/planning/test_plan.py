@@ -380,7 +380,7 @@ def test_an_axis_is_spread_over_the_tasks_that_it_applies_to() -> None:
     wanted = Counter(row.task for row in plan.make(demos, pose, REPLAY, NO_TESTS) if row.axis == "pose")
     assert wanted.keys() == {task.name for task in tasks("libero_goal")} - STILL
     assert set(wanted.values()) == {2}
-    with pytest.raises(PipelineError, match=r"plan\.episodes\.pose: none of the chosen tasks"):
+    with pytest.raises(PipelineError, match=r"plan\.episodes\.pose: none of the selected tasks"):
         plan.make([demo for demo in demos if demo.task.name in STILL], pose, REPLAY, NO_TESTS)
 
 

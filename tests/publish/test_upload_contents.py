@@ -147,8 +147,8 @@ def rotten(data: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "complaint"),
     [
-        (rotten, r"\.mp4: has changed since it was written"),
-        (unvalidated, r"validation\.json: not there"),
+        (rotten, r"\.mp4: was changed since it was written"),
+        (unvalidated, r"validation\.json: the file is missing"),
         (failed, r"1 of 1 checks failed: gripper \(episode-1 is turned\)"),
         (vacuous, "at least one check"),
         (exported_since, r"validation\.json: older than .*info\.json"),
@@ -158,7 +158,7 @@ def rotten(data: Path) -> None:
         (hidden, r"1 foreign files.*\.cache/note"),
         (elsewhere, r"1 links to files elsewhere, such as tiny/meta/stats\.json"),
         (folder_elsewhere, "such as tiny/more"),
-        (key_in_card, r"card: 1 files are not as they were generated: lerobot/\.env \(added\)"),
+        (key_in_card, r"card: 1 files differ from the generated ones: lerobot/\.env \(added\)"),
         (key_in_finetune, r"finetune: .*: wandb_key\.json \(added\)"),
         (repository_in_card, r"lerobot/\.git/config \(added\)"),
         (link_in_card, r"lerobot/pictures/key\.png \(a link\)"),

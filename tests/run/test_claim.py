@@ -79,7 +79,7 @@ def test_a_renamed_file_keeps_the_folder_until_it_is_edited(clone: Path) -> None
     Path("configs/tiny.yaml").rename(renamed)
     unedited = renamed.read_text()
     edit(renamed, plan={"seed": 6, "episodes": {"noise": 4}})
-    with pytest.raises(PipelineError, match=r"belongs to configs/tiny\.yaml, which is not there"):
+    with pytest.raises(PipelineError, match=r"belongs to configs/tiny\.yaml, which is missing"):
         claimed(renamed)
     renamed.write_text(unedited)
     claimed(renamed)
@@ -174,7 +174,7 @@ def test_a_folder_whose_configuration_is_out_of_sight_is_not_for_another_content
     mark = Path("data/tiny") / OWNER
     mark.write_text(json.dumps(json.loads(mark.read_text()) | {"configuration": "../../../machine/configs/tiny.yaml"}))
     edit(Path("configs/tiny.yaml"), plan={"seed": 6, "episodes": {"noise": 4}})
-    with pytest.raises(PipelineError, match=r"which is not there, and .*configs/tiny\.yaml has another content"):
+    with pytest.raises(PipelineError, match=r"which is missing, and .*configs/tiny\.yaml has different content"):
         claimed(Path("configs/tiny.yaml"))
 
 
@@ -184,7 +184,9 @@ def test_a_folder_with_files_that_no_run_made_is_not_claimed(place: str, clone: 
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
     before = {path: path.lstat().st_mtime_ns for path in clone.rglob("*")}
-    with pytest.raises(PipelineError, match=f"data/tiny: holds files and is not the folder of a run.*{place[:6]}"):
+    with pytest.raises(
+        PipelineError, match=f"data/tiny: the folder contains files and is not the folder of a run.*{place[:6]}"
+    ):
         claimed(Path("configs/tiny.yaml"))
     assert {path: path.lstat().st_mtime_ns for path in clone.rglob("*")} == before
 
@@ -244,7 +246,7 @@ def test_a_plan_without_a_task_that_was_asked_for_is_refused(clone: Path) -> Non
     run_stages(clone, config, ["plan"])
     plan_of_both = (clone / "data" / "tiny" / "plan.parquet").read_bytes()
     (clone / "demos" / BOWL.suite / f"{BOWL.name}_demo.hdf5").unlink()
-    with pytest.raises(AssertionError, match=rf"1 of the chosen tasks have no usable demonstration: .*{BOWL.name}"):
+    with pytest.raises(AssertionError, match=rf"1 of the selected tasks have no usable demonstration: .*{BOWL.name}"):
         run_stages(clone, config, ["plan"])
     assert (clone / "data" / "tiny" / "plan.parquet").read_bytes() == plan_of_both
 
@@ -258,7 +260,7 @@ def test_a_mark_that_cannot_be_read_is_named(clone: Path) -> None:
     claimed(Path("configs/tiny.yaml"))
     mark = Path("data/tiny") / OWNER
     mark.write_text("")
-    with pytest.raises(PipelineError, match=f"{mark}: cannot read which configuration"):
+    with pytest.raises(PipelineError, match=f"{mark}: the mark of the folder does not name a configuration file"):
         claimed(Path("configs/tiny.yaml"))
 
 
@@ -313,7 +315,7 @@ def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
     """A stage deletes what it did not plan: what the link leads to may be somebody else's."""
     data = claimed(Path("configs/tiny.yaml")).data
     (data / "frames").symlink_to(clone / "configs")
-    with pytest.raises(PipelineError, match="data/tiny/frames: is a symbolic link"):
+    with pytest.raises(PipelineError, match="data/tiny/frames: the entry of the run's folder is a symbolic link"):
         claimed(Path("configs/tiny.yaml"))
 
 
@@ -336,7 +338,9 @@ def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone
     theirs = claimed(Path("configs/tiny.yaml")).data / place
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
-    with pytest.raises(AssertionError, match=rf"data/tiny: holds files that no stage .* made.*{theirs.name[:9]}"):
+    with pytest.raises(
+        AssertionError, match=rf"data/tiny: the folder contains files that no stage .* generated.*{theirs.name[:9]}"
+    ):
         run_stages(clone, yaml.safe_load(Path("configs/tiny.yaml").read_text()), ["inputs"])
     assert theirs.read_bytes() == b"mine"
 
@@ -371,7 +375,7 @@ def test_clean_needs_a_mark_and_names_foreign_files(
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
     assert command_line.main() == 1
-    assert "data/tiny: holds files and is not the folder of a run" in capsys.readouterr().err
+    assert "data/tiny: the folder contains files and is not the folder of a run" in capsys.readouterr().err
     theirs.rename("holiday.jpg")
     theirs.parent.rmdir()
     claimed(Path("configs/tiny.yaml"))

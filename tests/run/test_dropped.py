@@ -83,7 +83,7 @@ def test_a_run_stops_before_it_deletes_and_status_and_doctor_say_the_same(
     assert finding.status == "warn"
     assert amount in finding.detail
     monkeypatch.setenv(REMAKE, "1")
-    assert "no longer needed, and deleted" in run_stages(clone, fields, stages)
+    assert "later stages delete finished work that is no longer needed" in run_stages(clone, fields, stages)
 
 
 def test_datasets_count_as_finished_work_after_their_frames_were_deleted(clone: Path) -> None:

@@ -66,7 +66,7 @@ def test_the_command_tells_what_is_short_and_fails_where_nothing_was_made(
     monkeypatch.setattr("sys.argv", ["pipeline", "demos", "expand", "out", "--tasks", *TASKS.tasks, "--per-task", "2"])
     assert main() == 1
     told = capsys.readouterr().out
-    assert "2 fewer than asked for of libero_goal/turn_on_the_stove" in told
+    assert "libero_goal/turn_on_the_stove: 2 of 2 requested demonstrations are missing" in told
     assert "configuration" not in told
 
 

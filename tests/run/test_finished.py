@@ -8,12 +8,13 @@ import pytest
 from conftest import dvc, rot
 from synthetic import episodes, write_rlds
 
-from pipeline import identity
+from pipeline import identity, stages
 from pipeline.config import Config, load
 from pipeline.formats.rlds import Rlds
 from pipeline.run import export
 from pipeline.run.finished import Memory, previews_memory, report_memory, summary_memory, validate_memory
 from pipeline.run.run import Run
+from pipeline.stores.store import TABLE
 
 REMEMBERED: tuple[Callable[[Run], Memory], ...] = (validate_memory, summary_memory, report_memory, previews_memory)
 
@@ -78,6 +79,28 @@ def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[boo
     assert hold(config) == expected
 
 
+@pytest.mark.parametrize(
+    ("name", "stage"),
+    [
+        ("datasets.json", "export_rlds"),
+        ("rlds", "export_rlds"),
+        ("lerobot", "export_lerobot"),
+        ("frames", "render"),
+        ("trajectories", "replay"),
+    ],
+)
+def test_a_lost_file_is_named(config: Config, name: str, stage: str) -> None:
+    lost = config.data / name
+    if lost.is_dir():
+        lost = max(lost.rglob("*.*"), key=lambda file: (file.is_file() and file.name != TABLE, file.stat().st_size))
+    assert stages.why_not(stage, Run(config)) is None
+    lost.unlink()
+    reason = f"{lost.relative_to(config.data).as_posix()} is missing"
+    assert stages.why_not(stage, Run(config)) == reason
+    if name != "datasets.json":
+        assert validate_memory(Run(config)).why_not() == reason
+
+
 def test_what_found_something_off_is_not_remembered(config: Config) -> None:
     rot(largest(config.data / "rlds"))
     (config.data / "validation.json").unlink()
@@ -106,7 +129,7 @@ def test_a_finished_dataset_is_made_anew_only_where_that_was_allowed(
     monkeypatch.setattr(Rlds, "recipe", number)
     assert not export.is_current(target, same)
     files = len(target.record().files)
-    assert export.outdated(target, same) == {f"files, made with recipe of rlds {number - 1}, here {number}": files}
+    assert export.outdated(target, same) == {f"files, generated with recipe of rlds {number - 1}, here {number}": files}
     assert not export.outdated(target, episodes(content="other episodes")), "which somebody asked for"
 
 

@@ -276,7 +276,7 @@ def test_lerobot_v21_is_made_checked_and_described_where_it_is_asked_for(
     config = tiny_config(short_demos)
     config["export"]["lerobot_v21"] = {"name": "libero_tiny", "convention": "ipec"}
     printed = run_stages(tmp_path, config, ["exports", "manifest", "validate", "recipe", "card"])
-    assert "lerobot has these" in printed, "v3.0 stays"
+    assert "lerobot is up to date" in printed, "v3.0 stays"
     assert (data / "manifest.parquet").read_bytes() == manifest_before
     sets = {folder.name for folder in (data / "lerobot_v21").iterdir()}
     assert sets == {"libero_tiny_goal", "libero_tiny_object"}

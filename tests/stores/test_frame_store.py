@@ -102,9 +102,9 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
     next_recipe(step)
     number = f"recipe of {step} {identity.RECIPES[step] - 1}, here {identity.RECIPES[step]}"
     found = outdated(rows, TrajectoryStore(stored.root), FrameStore(store.root, config.render))
-    told = {f"files of frames, made with {number}": 1}
-    assert found == told | ({f"trajectories, made with {number}": 1} if step == "physics" else {})
-    with pytest.raises(PipelineError, match=rf"1 files of frames, made with {number}(?s:.*)REMAKE=1` before"):
+    told = {f"files of frames, generated with {number}": 1}
+    assert found == told | ({f"trajectories, generated with {number}": 1} if step == "physics" else {})
+    with pytest.raises(PipelineError, match=rf"1 files of frames, generated with {number}(?s:.*)REMAKE=1` before"):
         identity.refuse_unasked(found, tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
     monkeypatch.setenv(identity.REMAKE, "1")
@@ -129,7 +129,7 @@ def test_what_the_user_changed_is_made_without_a_question(
     assert not changed.rows()
     assert not outdated(rows, stored, changed, gl.choose().device)
     device = outdated(rows, stored, store, "another device")
-    assert device == {f"files of frames, made with OpenGL device {gl.choose().device}, here another device": 1}
+    assert device == {f"files of frames, generated with OpenGL device {gl.choose().device}, here another device": 1}
     assert not outdated([], stored, store), "a file that no episode of today's plan needs"
 
 
@@ -245,7 +245,10 @@ def test_a_damaged_file_is_an_error_and_is_never_silently_rendered_again(
         lambda: store.stored(rows[0].trajectory_id, wanted, gl.choose().device),
         lambda: render_into(frames, rows, config, replayed, nothing_to_do),
     ):
-        with pytest.raises(PipelineError, match=rf"(?s){store.path(damaged).name}: damaged \(.+\).*move the file away"):
+        with pytest.raises(
+            PipelineError,
+            match=rf"(?s){store.path(damaged).name}: the file is damaged \(.+\).*move the file to another place",
+        ):
             read()
     assert store.path(damaged).read_bytes() == before[:-100]
     store.path(damaged).rename(tmp_path / "moved away")
@@ -274,7 +277,7 @@ def test_rendering_that_leaves_the_same_work_undone_is_an_error(
         """Workers that write into a folder of their own."""
         return []
 
-    with pytest.raises(PipelineError, match="still not there"):
+    with pytest.raises(PipelineError, match="still missing"):
         render_into(tmp_path, rows[:1], config, replayed, elsewhere)
 
 

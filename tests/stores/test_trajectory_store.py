@@ -144,7 +144,9 @@ def test_a_damaged_trajectory_is_an_error_with_its_reason_and_is_never_silently_
         lambda: outcome.replayed(rows, TrajectoryStore(trajectories)),
         lambda: Replays(config.demos, config.replay, TrajectoryStore(trajectories), nothing_to_do).complete(rows),
     ):
-        with pytest.raises(PipelineError, match=rf"(?s){file.name}: damaged \(.+\).*move the file away"):
+        with pytest.raises(
+            PipelineError, match=rf"(?s){file.name}: the file is damaged \(.+\).*move the file to another place"
+        ):
             read()
     assert file.read_bytes() == damaged
     file.rename(trajectories.parent / "moved away")
@@ -214,7 +216,7 @@ def test_a_changed_number_is_not_read(trajectories: Path, name: str) -> None:
 
     file = next(trajectories.glob("*.npz"))
     _rewrite(file, change_last_number)
-    with pytest.raises(PipelineError, match=rf"damaged .*{name}(?s:.*)move the file away"):
+    with pytest.raises(PipelineError, match=rf"damaged .*{name}(?s:.*)move the file to another place"):
         TrajectoryStore(trajectories).load(file.stem)
 
 
@@ -277,7 +279,7 @@ def test_files_that_nobody_wrote_down_what_they_were_made_with_are_not_replaced_
     run = run_in(trajectories.parent)
     _make_foreign(next(trajectories.glob("*.npz")))
     assert outdated(rows, run.trajectories, run.frames) == {
-        "trajectories, made with something that was not written down": 1
+        "trajectories, generated with unrecorded versions and settings": 1
     }
     _shorten(next(trajectories.glob("*.npz")))
     with pytest.raises(PipelineError, match="damaged"):
@@ -291,7 +293,7 @@ def test_hdf5_files_of_an_earlier_version_are_not_replaced_unasked(rows: list[pl
     frames = trajectories.parent / "frames" / file.stem / "0123.h5"
     frames.parent.mkdir(parents=True)
     frames.write_bytes(b"frames of an earlier version")
-    earlier = "made with the HDF5 container of an earlier version"
+    earlier = "generated with the HDF5 container of an earlier version"
     assert outdated(rows, run.trajectories, run.frames) == {
         f"trajectories, {earlier}": 1,
         f"files of frames, {earlier}": 1,

@@ -77,6 +77,26 @@ def test_disk_is_asked_for_as_the_configuration_needs_it(
     assert "fail  disk" in capsys.readouterr().err
 
 
+def test_no_word_of_the_results_is_broken_at_80_columns(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Paths and commands can be copied, whatever their length."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    link_testset(tmp_path)
+    long = "/a/path/that/is/longer/than/the/column/of/the/results/of/all/checks/and/still/in/one/piece"
+    broken = doctor.Diagnosis("demos", "fail", f"no demonstration is in {long}", f"hf download --local-dir {long} [me]")
+    listed = [*found(tmp_path / "data").values(), broken]
+    monkeypatch.setattr(doctor, "check", lambda run, need_gb: listed)
+    assert run_doctor("starter", monkeypatch, free_gb=1) == 1
+    lines = capsys.readouterr().err.splitlines()
+    words = {word for line in lines for word in line.split()}
+    for finding in listed:
+        assert {*finding.name.split(), *finding.detail.split(), *finding.remedy.split()} <= words
+    assert all(len(line) <= 80 for line in lines if long not in line)
+    assert "try: hf download --local-dir" in " ".join(" ".join(lines).split())
+
+
 @pytest.mark.parametrize(("name", "gb"), [("full", 440), ("paper", 350), ("joint", 94), ("small", 30)])
 def test_the_room_that_configurations_name_is_what_doctor_asks_for(name: str, gb: int) -> None:
     file = REPOSITORY / "configs" / f"{name}.yaml"
@@ -224,7 +244,7 @@ def test_tensorflow_beside_the_renderer(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 def test_no_opengl(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def nothing() -> gl.GlChoice:
-        raise PipelineError("no OpenGL renders here", remedy=gl.REMEDY)
+        raise PipelineError("no OpenGL back end renders here", remedy=gl.REMEDY)
 
     monkeypatch.setattr(gl, "choose", nothing)
     assert failures(tmp_path)["OpenGL"].remedy == gl.REMEDY
@@ -301,7 +321,7 @@ def test_a_run_goes_on_where_steps_and_frames_are_the_same(
     run_stage(config)  # This machine was tried, and is the same.
     another = platform.uname_result("Linux", "another", "", "", "x86_64")
     monkeypatch.setattr(platform, "uname", lambda: another)
-    with pytest.raises(PipelineError, match="this machine cannot make the run"):
+    with pytest.raises(PipelineError, match="this machine cannot perform the run"):
         run_stage(config)
 
 
@@ -319,11 +339,11 @@ def test_a_run_is_not_gone_on_with_where_the_same_versions_compute_otherwise(tmp
     """Its files would count as current, and be of two kinds."""
     run = run_in(stored(tmp_path / "run", "trajectories", "frames"))
     machine.record(run, TRIAL)
-    cases = {"ten steps": "its trajectories and its frames", "one frame": "its frames"}
+    cases = {"ten steps": "trajectories and frames", "one frame": "frames"}
     for name, store in cases.items():
-        with pytest.raises(PipelineError, match=f"the run was begun where {name}, made by") as caught:
+        with pytest.raises(PipelineError, match=rf"the trial \({name}, made by") as caught:
             machine.record(run, TRIAL | {name: "other"})
-        assert str(caught.value).endswith(f"move away {store}")
+        assert str(caught.value).endswith(f"move the folders {store} to another place")
     machine.record(run, TRIAL | {"OpenGL device": "two", "one frame": "cdef"})
     machine.record(run, TRIAL)
 
@@ -335,7 +355,9 @@ def test_what_nothing_was_made_with_yet_may_change(tmp_path: Path) -> None:
     machine.record(run, TRIAL | {"ten steps": "89ab"})
     stored(run.folder, "trajectories")
     machine.record(run, TRIAL | {"ten steps": "89ab", "one frame": "cdef"})
-    with pytest.raises(PipelineError, match=r"ten steps, made by .* came to 89ab, here it is 0123"):
+    with pytest.raises(
+        PipelineError, match=r"ten steps, made by .* gave 89ab on the machine that began the run, and gives 0123 here"
+    ):
         machine.record(run, TRIAL | {"one frame": "cdef"})
 
 

@@ -101,7 +101,7 @@ def test_without_the_dataset_it_is_only_made_and_says_so(
     shown = capsys.readouterr()
     found = json.loads(shown.out.splitlines()[-1])
     assert (found["identical"], found["reason"], found["differs"]) == (None, "kept", {})
-    assert "no RLDS set lies beside" in shown.err
+    assert "no RLDS dataset is next to" in shown.err
     assert list((tmp_path / "out" / "rlds").rglob("*.tfrecord-*"))
 
 

@@ -261,7 +261,9 @@ def test_planted_faults_stop_the_run_and_nothing_else_is_found(
     record_as_written(data)
     killed = data / ".work" / "validate" / "of a killed run"
     killed.mkdir(parents=True)
-    with pytest.raises(AssertionError, match=r"(?s)findings in all: counts 1, .*try: read data/tiny/validation\.json"):
+    with pytest.raises(
+        AssertionError, match=r"(?s)number of findings of each check: counts 1, .*try: read data/tiny/validation\.json"
+    ):
         run_stages(tmp_path, tiny_config(short_demos), ["validate"])
     report = json.loads((data / "validation.json").read_text())
     found = {

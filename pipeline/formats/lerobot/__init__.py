@@ -28,12 +28,14 @@ class LeRobotConfig(FormatOptions):
     """Options of the LeRobot dataset.
 
     Attributes:
-        name: of the dataset; ``libero_`` and the name of the run when left out.
-        shards: files of each kind, at least; more where one would have more than 200 MB.
-        frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
-        validation: share of each task's demonstrations whose episodes come last, as the split ``val``.
-        language: whether frames also have their task's rewrites and what is being done, in lerobot's language column.
-            lerobot before 0.6 cannot read a set with it.
+        name: Name of the dataset; ``libero_`` and the name of the run by default.
+        shards: Least number of files of each kind; by default as many as are needed for files of at most 200 MB.
+        frames: Storage of the frames: ``video`` is H.264, ``images`` are the JPEG files of RLDS, three times as large;
+            ``video`` by default.
+        validation: Share of each task's demonstrations in the split ``val``, whose episodes come last, 0 or 0.001 to
+            0.5; 0 by default.
+        language: True adds the task's rewrites and the current subtask to every frame, in lerobot's language column;
+            false by default. Versions of lerobot before 0.6 cannot read such a dataset.
     """
 
     name: Name = ""
@@ -190,10 +192,13 @@ class LeRobotV21Config(FormatOptions):
     """Options of LeRobot datasets of version 2.1.
 
     Attributes:
-        name: of the dataset, or what the sets' names begin with; ``libero_`` and the name of the run when left out.
-        convention: ``ipec`` for GR00T, starVLA and others: a set for each suite, as IPEC-COMMUNITY's of LIBERO, with
-            videos and a gripper of 1 open, 0 closed. ``openpi``: one set, as openpi's configuration of LIBERO reads it.
-        validation: share of each task's demonstrations whose episodes go into sets of their own, named ``..._val``.
+        name: Name of the dataset, or first part of the names of its sets; ``libero_`` and the name of the run by
+            default.
+        convention: Layout of the dataset. ``ipec``, for GR00T, starVLA and others, has a set for each suite, videos,
+            and a gripper of 1 (open) and 0 (closed), like IPEC-COMMUNITY's LIBERO datasets. ``openpi`` has one set,
+            as openpi's configuration of LIBERO reads it.
+        validation: Share of each task's demonstrations in separate sets, named ``..._val``, 0 or 0.001 to 0.5; 0 by
+            default.
     """
 
     name: Name = ""
@@ -205,7 +210,10 @@ class LeRobotOpenpiConfig(LeRobotV21Config):
     """Options of the LeRobot dataset of version 2.1 for openpi.
 
     Attributes:
-        convention: always ``openpi``.
+        name: Name of the dataset; ``libero_`` and the name of the run by default.
+        convention: Layout of the dataset, always ``openpi``.
+        validation: Share of each task's demonstrations in a separate set, named ``..._val``, 0 or 0.001 to 0.5; 0 by
+            default.
     """
 
     convention: Literal["openpi"] = "openpi"
