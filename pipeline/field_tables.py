@@ -71,7 +71,7 @@ def _flow(value: object) -> str:
 
 
 def _value(kind: Schema) -> str:
-    """Describe the values of one kind; ``null`` only says that the field may be left out."""
+    """Describe the values of one kind; ``null`` means that the field may be left out."""
     if "anyOf" in kind:
         return " or ".join(_value(choice) for choice in kind["anyOf"] if choice.get("type") != "null")
     if "enum" in kind:

@@ -127,7 +127,7 @@ def test_templates(template: Path) -> None:
 
 @pytest.mark.parametrize(
     "sentence",
-    ["What there is.", "It is made anew.", f"It has {'word ' * 30}end.", "Take 1, 2 or 3 of them.", "It goes on."],
+    ["What there is.", "It runs anew.", f"It has {'word ' * 30}end.", "Take 1, 2 or 3 of them.", "It goes on."],
 )
 def test_a_fault_is_noticed(sentence: str) -> None:
     assert len(wrong(sentence, numbers=True)) == 1

@@ -270,7 +270,7 @@ class Axis(Frozen):
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> CoveragePlots:
         """Describe plots of the perturbations of kept episodes, next to the test tasks.
 
-        By default, there is one plot of the level and one of each numeric parameter.
+        There is a plot of the level and one of each numeric parameter, unless an axis describes others.
         """
         parameters = []
         for parameter, field in cls.draws[0].model_fields.items():
