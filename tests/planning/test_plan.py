@@ -93,7 +93,7 @@ def test_round_trip(tmp_path: Path) -> None:
     plan.write(rows, tmp_path / "again.parquet")
     assert (tmp_path / "plan.parquet").read_bytes() == (tmp_path / "again.parquet").read_bytes()
     (tmp_path / "plan.parquet").write_bytes(b"PAR1 cut short")
-    with pytest.raises(PipelineError, match=r"plan\.parquet: damaged"):
+    with pytest.raises(PipelineError, match=r"plan\.parquet: the file is damaged"):
         plan.read(tmp_path / "plan.parquet")
 
 

@@ -194,7 +194,7 @@ def test_a_folder_with_files_that_no_run_made_is_not_claimed(place: str, clone: 
 def test_a_file_in_place_of_the_folder_is_named(clone: Path) -> None:
     (clone / "data").mkdir()
     (clone / "data" / "tiny").write_bytes(b"mine")
-    with pytest.raises(PipelineError, match="data/tiny: not a folder"):
+    with pytest.raises(PipelineError, match="data/tiny: the path is not a folder"):
         claimed(Path("configs/tiny.yaml"))
 
 
@@ -350,7 +350,7 @@ def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
     link = data / "trajectories" / "0123456789abcdef.npz"
     link.parent.mkdir()
     link.symlink_to(clone / "configs" / "tiny.yaml")
-    with pytest.raises(AssertionError, match=r"no stage of this run made.*trajectories/0123456789abcdef\.npz"):
+    with pytest.raises(AssertionError, match=r"no stage of this run generated.*trajectories/0123456789abcdef\.npz"):
         run_stages(clone, yaml.safe_load(Path("configs/tiny.yaml").read_text()), ["inputs"])
 
 

@@ -215,7 +215,7 @@ def test_only_what_an_expansion_made_is_replaced(tmp_path: Path, attrs: dict[str
         assert expand(tmp_path, TASKS, [], 1, loop).short == {f"{STOVE.suite}/{STOVE.name}": 1}
         assert not file.exists()
     else:
-        with pytest.raises(PipelineError, match="that no expansion made"):
+        with pytest.raises(PipelineError, match="that no expansion generated"):
             expand(tmp_path, TASKS, [], 1, loop)
         assert file.read_bytes() == before
 
@@ -228,6 +228,6 @@ def test_a_file_without_demonstrations_is_not_taken_for_an_expansion(tmp_path: P
         content.create_group("data")
         content["raw"] = np.arange(10)
     before = file.read_bytes()
-    with pytest.raises(PipelineError, match="that no expansion made"):
+    with pytest.raises(PipelineError, match="that no expansion generated"):
         expand(tmp_path, TASKS, [], 1, loop)
     assert file.read_bytes() == before

@@ -141,7 +141,7 @@ def test_a_lost_shard_is_made_again_and_a_damaged_trajectory_once_it_is_moved_aw
     trajectory.write_bytes(before[1][: len(before[1]) // 2])
     stopped = dvc(clone, "repro")
     assert stopped.returncode != 0
-    assert f"{trajectory.name}: damaged" in stopped.stdout + stopped.stderr
+    assert f"{trajectory.name}: the file is damaged" in stopped.stdout + stopped.stderr
     assert len(trajectory.read_bytes()) == len(before[1]) // 2
     trajectory.rename(clone / trajectory.name)
     done = dvc(clone, "repro")

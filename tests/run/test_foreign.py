@@ -24,9 +24,10 @@ def test_liberos_sets_beside_ours_are_refused_and_stay(content: str, tmp_path: P
     elsewhere.mkdir()
     target.folder.joinpath("libero_10_no_noops").symlink_to(elsewhere)
     before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
-    with pytest.raises(PipelineError, match=re.escape("rlds/libero_10_no_noops: not of this run's RLDS")) as error:
+    message = re.escape("rlds/libero_10_no_noops: the entry is not of this run's RLDS")
+    with pytest.raises(PipelineError, match=message) as error:
         _bring_up_to_date(target, episodes(content=content), RUN)
-    assert "(2 such)" in str(error.value)
+    assert "(2 such entries)" in str(error.value)
     assert f"move it out of {target.folder}" in str(error.value)
     assert {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
@@ -57,6 +58,6 @@ def test_a_file_inside_a_set_is_refused_and_stays(content: str, write: Any, tmp_
     target = write(tmp_path)
     theirs = next(path for path in target.folder.rglob("*.json")).parent / "README.md"
     theirs.write_text("mine")
-    with pytest.raises(PipelineError, match=r"README\.md: not of this run's"):
+    with pytest.raises(PipelineError, match=r"README\.md: the entry is not of this run's"):
         _bring_up_to_date(target, episodes(content=content), RUN)
     assert theirs.read_text() == "mine"
