@@ -67,14 +67,14 @@ def test_the_page_of_fields_is_that_of_the_code() -> None:
 def models_in(annotation: Any) -> set[type[BaseModel]]:
     """Find the models that a type annotation contains, and the models in their fields."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        found = {annotation}
+        found: set[type[BaseModel]] = {annotation}
         for field in annotation.model_fields.values():
             found |= models_in(field.annotation)
         return found
     return set().union(*(models_in(part) for part in get_args(annotation)))
 
 
-@pytest.mark.parametrize("model", sorted(models_in(Config), key=lambda model: model.__name__))
+@pytest.mark.parametrize("model", sorted(models_in(Config), key=str))
 def test_every_field_is_described(model: type[BaseModel]) -> None:
     """The descriptions are a table of the documentation: one entry for each field, in whole sentences."""
     entries = inspect.getdoc(model).partition("Attributes:\n")[2]  # type: ignore[union-attr]

@@ -231,7 +231,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
     name: ClassVar = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
-    options_type: ClassVar = LeRobotV21Config
+    options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
     recipe: ClassVar = 3
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = LeRobot.group
