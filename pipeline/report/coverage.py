@@ -13,7 +13,6 @@ from pipeline.report import figures
 from pipeline.report.figures import Panel
 from pipeline.testset.benchmark import TestSet
 
-
 LABEL_WIDTH = 28
 """Longest line of a label, in characters; a longer line would not fit below a plot with long names of rows."""
 
