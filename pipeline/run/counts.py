@@ -175,7 +175,7 @@ def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
     for axis in axes:
         cells = [Counts.of(rows, axis=axis, suite=suite) for suite in suites]
         in_all = Counts.of(rows, axis=axis)
-        # The name of a combination may break after a +.
+        # A combination's name may break behind a +.
         table.add_row(axis.replace("+", "+ "), *map(str, cells), str(in_all), str(target_of[axis].wanted))
     wanted = sum(target.wanted for target in target_of.values())
     totals = [Counts.of(rows, suite=suite) for suite in suites]
