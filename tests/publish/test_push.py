@@ -114,7 +114,7 @@ def test_goes_on_after_the_network_broke(hub: Hub, made: Path) -> None:
     hub.allowed, hub.cuts = 2, 1000
     with pytest.raises(PipelineError, match=r"stopped.*Error while uploading") as caught:
         send(upload, REPOSITORY)
-    assert "run it again" in str(caught.value)
+    assert "run the command again" in str(caught.value)
     assert (hub.files, hub.tags) == ({".gitattributes": ATTRIBUTES}, {})
     arrived = list(hub.sent)
     assert 0 < len(arrived) < len(large(upload))
@@ -179,7 +179,7 @@ def test_an_unreachable_hub_and_a_wrong_name_are_told_apart(
     hub: Hub, made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     upload = prepare(made, "rlds")
-    with pytest.raises(PipelineError, match="refused"):
+    with pytest.raises(PipelineError, match="the hub rejected the upload"):
         send(upload, "not a name")
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
     with pytest.raises(PipelineError, match="stopped"):
@@ -297,7 +297,7 @@ def test_a_public_repository_is_not_taken_for_a_private_one(hub: Hub, made: Path
     send(upload, REPOSITORY)
     commits = hub.commits
     for attempt in (compare, send):
-        with pytest.raises(PipelineError, match="is public, and --private"):
+        with pytest.raises(PipelineError, match="is public, but --private"):
             attempt(upload, REPOSITORY, private=True)
     assert (hub.private, hub.commits) == (False, commits)
 

@@ -68,4 +68,4 @@ def test_a_run_that_keeps_fewer_than_wanted_says_so_everywhere(
     assert not any("all datasets are finished" in part for part in told)
     assert sentence in (clone / "data" / "tiny" / "report.html").read_text()
     card = (clone / "data" / "tiny" / "card" / "rlds" / "README.md").read_text()
-    assert f"Of {axis}, {kept[axis]} of {wanted} wanted episodes were kept." in card
+    assert f"On the axis {axis}, {kept[axis]} of {wanted} wanted episodes were kept." in card
