@@ -61,7 +61,7 @@ def models_in(annotation: Any) -> set[type[BaseModel]]:
     return set().union(*(models_in(part) for part in get_args(annotation)))
 
 
-@pytest.mark.parametrize("model", sorted(models_in(Config), key=lambda model: model.__name__))
+@pytest.mark.parametrize("model", sorted(models_in(Config), key=str))
 def test_every_field_is_described(model: type[BaseModel]) -> None:
     """The descriptions are a table of the documentation: one entry for each field, in whole sentences."""
     entries = inspect.getdoc(model).partition("Attributes:\n")[2]  # type: ignore[union-attr]
