@@ -205,7 +205,7 @@ def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = check(Path("own"), 2, loop)
     assert (found.files, found.demonstrations, found.missed) == (2, 4, ["my_suite/bowl_away/demo_1"])
     missing = [fault.split("my_suite/")[1].split(",")[0] for fault in found.faults]
-    assert missing == [f"bowl_cooks_demo.hdf5 data/demo_{n}: misses its goal" for n in (0, 1)]
+    assert missing == [f"bowl_cooks_demo.hdf5 data/demo_{n}: the demonstration misses its goal" for n in (0, 1)]
 
     said = {"name": "own", "demos": {"root": "own", "tasks": ["my_suite/*"]}, "plan": {"episodes": {"camera": 1}}}
     config = Config.model_validate(said)
