@@ -99,7 +99,8 @@ def sort_modules(items: list[pytest.Item]) -> None:
     """
     slow_tests = Counter(item.path for item in items if item.get_closest_marker("slow"))
     need_run = {item.path for item in items if "finished" in fixtures_of(item)}
-    first = max(need_run, key=lambda path: slow_tests[path], default=None)
+    # All processes must choose the same module, also among modules with equal numbers.
+    first = max(need_run, key=lambda path: (slow_tests[path], path), default=None)
 
     def place(item: pytest.Item) -> tuple[bool, bool, bool, int]:
         slow = slow_tests[item.path]
