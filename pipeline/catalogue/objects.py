@@ -7,6 +7,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import AGAIN, Source, catalogue, converted, offered
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
+from pipeline.origins import REINSTALL
 from pipeline.types import Task
 
 TEST_CATEGORIES = frozenset(
@@ -62,7 +63,7 @@ def find(name: str, sha256: str) -> ObjectModel:
         raise PipelineError(
             f"the object {name} differs from the planned object",
             where=model.mjcf,
-            remedy="rm -rf .venv && bash setup.sh" if installed else f"move its folder away and run {AGAIN}",
+            remedy=REINSTALL if installed else f"move its folder away and run {AGAIN}",
         )
     return model
 

@@ -15,6 +15,7 @@ from pipeline.catalogue import object_sources
 from pipeline.errors import PipelineError
 from pipeline.files import checksum
 from pipeline.libero.assets import installed, name_of
+from pipeline.origins import REINSTALL
 
 _OBJECTS, _HASH = "objects/", "#sha256="
 # The pattern matches attributes in ElementTree's notation. Besides file, a cube texture has fileright, fileleft and so
@@ -76,7 +77,7 @@ def _found(name: str, where: object) -> str:
             return installed(name)
         except ValueError as error:
             raise PipelineError(
-                f"the scene uses {name}: {error}", where=where, remedy="rm -rf .venv && bash setup.sh"
+                f"the scene uses {name}: {error}", where=where, remedy=REINSTALL
             ) from error
     below, _, sha256 = name.removeprefix(_OBJECTS).partition(_HASH)
     file = object_sources.FOLDER.resolve() / below
