@@ -331,7 +331,7 @@ def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path)
         evaluate(evaluation(policy, tmp_path, EpisodeSettings(seed=1)), CHOSEN, loop)
     with pytest.raises(PipelineError, match="instruction of the benchmark"):
         evaluate(evaluation(policy, tmp_path, EpisodeSettings(prompt="benchmark")), CHOSEN, loop)
-    with pytest.raises(PipelineError, match="libero_spatial alone"):
+    with pytest.raises(PipelineError, match="only in libero_spatial"):
         evaluate(evaluation(policy, tmp_path, EpisodeSettings(step_limits="lerobot")), CHOSEN, loop)
 
 
