@@ -31,7 +31,7 @@ def table(model: Schema) -> str:
 
     Fields that are sections of their own have a table of their own, and are left out.
     """
-    lines = ["| field | values | default | |", "|---|---|---|---|"]
+    lines = ["| field | values | default | meaning |", "|---|---|---|---|"]
     required = model.get("required", ())
     for name, field in model["properties"].items():
         if _is_section(field):
