@@ -110,7 +110,7 @@ def test_workers_that_die_while_they_start_are_started_again(deaths: int, tmp_pa
 
     killer = threading.Thread(target=kill_the_first_of_each_start, daemon=True)
     killer.start()
-    refused = pytest.raises(PipelineError, match=f"{TRIES} times(?s:.*)fewer workers")
+    refused = pytest.raises(PipelineError, match=f"{TRIES} times(?s:.*)reduce compute.workers")
     with (
         nullcontext() if deaths < TRIES else refused,
         runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run,

@@ -147,7 +147,7 @@ def rotten(data: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "complaint"),
     [
-        (rotten, r"\.mp4: was changed since it was written"),
+        (rotten, r"\.mp4: has changed since it was written"),
         (unvalidated, r"validation\.json: the file is missing"),
         (failed, r"1 of 1 checks failed: gripper \(episode-1 is turned\)"),
         (vacuous, "at least one check"),

@@ -45,7 +45,7 @@ def test_check_finds_a_deleted_file(part: str, finished: Path, tmp_path: Path) -
         without_table = verify(Run(config), loop)
     (told,) = with_table["damaged"]
     assert (with_table["checked"], told.partition(":")[0]) == (len(stored), str(stored[0].relative_to(tmp_path)))
-    assert "gone" in told
+    assert "it is missing" in told
     assert [what for result in without_table.values() for what in result["damaged"]]
 
 
