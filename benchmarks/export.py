@@ -54,6 +54,7 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
         state=rng.normal(size=(steps, *SCHEMA.state.shape)).astype(np.float32),
         joint_state=rng.normal(size=(steps, *SCHEMA.joint_state.shape)).astype(np.float32),
         action=rng.uniform(-1, 1, (steps, *SCHEMA.action.shape)).astype(np.float32),
+        action_absolute=rng.normal(size=(steps, *SCHEMA.action_absolute.shape)).astype(np.float32),
         instruction="put the black bowl on the plate",
         provenance=provenance | {"episode_id": episode_id},
         geometry=dict.fromkeys(SCHEMA.views, Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))),

@@ -87,7 +87,7 @@ class VectorSpec(Frozen):
 
 
 class StateSpec(VectorSpec):
-    """End-effector pose in ``frame`` and finger positions."""
+    """End-effector pose in ``frame`` and finger positions, or the goal of this pose and the gripper's command."""
 
     frame: str
 
@@ -135,12 +135,13 @@ class EpisodeSchema(Frozen):
     state: StateSpec
     joint_state: VectorSpec
     action: ActionSpec
+    action_absolute: StateSpec
     provenance: dict[str, Literal["string", "int64", "float32"]]
 
 
 SCHEMA = EpisodeSchema.model_validate_json(schema_file("episode.json").read_text())
 
-MOTION = ("action", "state", "joint_state")
+MOTION = ("action", "action_absolute", "state", "joint_state")
 """Numeric arrays of an episode, with a row for each step."""
 
 MATRICES = ("intrinsics", "extrinsics")

@@ -276,7 +276,7 @@ class Rendered:
 
     Attributes:
         replay_mode: method that produced the trajectory's actions.
-        state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
+        state: (K, 8), joint_state, action, action_absolute: (K, 7); see ``schemas/episode.json``.
         streams: stream id to K encoded frames.
         rejected: stream id to the reason why it was not rendered.
         geometry: id of a stream's geometry to the geometry.
@@ -289,6 +289,7 @@ class Rendered:
     state: NDArray[np.float32]
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]
+    action_absolute: NDArray[np.float32]
     streams: Mapping[str, Sequence[Jpeg]] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)
     geometry: Mapping[str, Geometry] = field(default_factory=dict)
@@ -311,7 +312,7 @@ class Episode:
     Attributes:
         episode_id: identity by content; it joins RLDS, LeRobot and manifest.
         frames: view name (``image``, ``wrist_image``) to T JPEG files, already rotated.
-        state, joint_state, action: (T, 8), (T, 7) and (T, 7) float32.
+        state: (T, 8), joint_state, action, action_absolute: (T, 7); all float32.
         instruction: the text the policy is prompted with.
         provenance: the columns named in ``schemas/episode.json``.
         geometry: view name to its camera matrices and maps.
@@ -325,6 +326,7 @@ class Episode:
     state: NDArray[np.float32]
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]
+    action_absolute: NDArray[np.float32]
     instruction: str
     provenance: Mapping[str, str | int | float]
     geometry: Mapping[str, Geometry]

@@ -15,6 +15,7 @@ import cv2
 import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
@@ -54,6 +55,7 @@ def episode(episode_id: str) -> Episode:
 
     action = rng.uniform(-1, 1, (steps, 7)).astype(np.float32)
     action[:, 6] = np.where(np.arange(steps) < 6, -1, 1)
+    state = rng.normal(size=(steps, 8)).astype(np.float32)
     provenance: dict[str, Any] = {}
     for column, dtype in SCHEMA.provenance.items():
         provenance[column] = {"string": f"{column} of {episode_id}", "int64": 7, "float32": 0.5}[dtype]
@@ -63,13 +65,21 @@ def episode(episode_id: str) -> Episode:
             "image": [frame(t, 60) for t in range(steps)],
             "wrist_image": [frame(t, 170) for t in range(steps)],
         },
-        state=rng.normal(size=(steps, 8)).astype(np.float32),
+        state=state,
         joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
         action=action,
+        action_absolute=goals(state, action),
         instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
         provenance=provenance | {"episode_id": episode_id},
         geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
     )
+
+
+def goals(state: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the absolute actions (T, 7) of actions that all turn the hand."""
+    hands, turns = Rotation.from_rotvec(state[:, 3:6]), Rotation.from_rotvec(0.5 * action[:, 3:6])
+    axis_angles = (turns * hands * Rotation.from_euler("z", -90, degrees=True)).as_rotvec()
+    return np.hstack([state[:, :3] + 0.05 * action[:, :3], axis_angles, action[:, 6:]]).astype(np.float32)
 
 
 @cache

@@ -1,6 +1,7 @@
 """The examples run on a finished run as they stand, and print what its manifest says."""
 
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -31,6 +32,12 @@ def test_load_rlds(finished: Path) -> None:
     for suite, count in Counter(str(row["suite"]).removeprefix("libero_") for row in kept(finished)).items():
         assert f"libero_tiny_{suite}: {count} episodes" in output
     assert "image: (256, 256, 3) uint8" in output
+
+
+def test_rotation_6d(finished: Path) -> None:
+    axis_angle, six, back = printed("rotation_6d", finished).splitlines()
+    assert (axis_angle.count(","), six.count(",")) == (6, 9)
+    assert float(re.findall(r"\S+(?= rad)", back)[0]) < 1e-6
 
 
 def test_load_lerobot(finished: Path) -> None:

@@ -58,6 +58,7 @@ TRAINED_ON = "Configuration of the policy's training data; held-out perturbation
     black="--black",
     initial_states="--initial-states",
     look_every="--look-every",
+    actions="--actions",
 )
 @model_options(PolicyConfig, label="--label", timeout_s="--timeout")
 @click.option("--assets", metavar="DIR", type=PATH, help="Folder of the unpacked asset archive of LIBERO-Plus.")

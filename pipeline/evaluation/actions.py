@@ -1,7 +1,7 @@
 """Checks of a policy's answer: finite numbers, in the action format of LIBERO's controller."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -31,8 +31,12 @@ def checked_actions(answer: Any, policy: str) -> Floats:
     return np.atleast_2d(actions)
 
 
+Actions = Literal["delta", "absolute"]
+"""Content of a policy's actions: deltas, or goals of position and orientation in the world; ``docs/`` compares them."""
+
 FORMATS = {
-    "position": ("delta_xyz", "raw"),
+    # X-VLA's server announces delta_xyz, and its absolute actions by a parameter.
+    "position": ("delta_xyz", "absolute_xyz", "raw"),
     # GR00T's server announces euler_xyz, but its policy learns axis-angles from LIBERO's data.
     "rotation": ("axis_angle", "euler_xyz", "raw"),
     "gripper": ("binary_close_positive", "raw"),
@@ -40,17 +44,20 @@ FORMATS = {
 """Part of an action to the formats that can be executed, in vla-eval's names; ``raw`` leaves the format open."""
 
 
-def refuse_other_actions(params: Mapping[str, Any], spec: Mapping[str, Mapping[str, Any]], server: str) -> None:
-    """Reject a model server whose actions are not deltas with a gripper that opens below 0.
+def refuse_other_actions(
+    params: Mapping[str, Any], spec: Mapping[str, Mapping[str, Any]], server: str, actions: Actions
+) -> None:
+    """Reject a model server with other actions than the evaluation executes, or with another gripper command.
 
     Args:
         params: the ``observation_params`` that the server announces.
         spec: the ``action_spec`` that the server announces.
+        actions: the actions that the evaluation executes.
 
     Raises:
         PipelineError: if the server announces other actions.
     """
-    unsupported = ["absolute_action"] if params.get("absolute_action") else []
+    unsupported = []
     for part, dimension in spec.items():
         if dimension["format"] not in FORMATS.get(part, ("raw",)):
             unsupported.append(f"{part} {dimension['format']}")
@@ -58,7 +65,16 @@ def refuse_other_actions(params: Mapping[str, Any], spec: Mapping[str, Mapping[s
         raise PipelineError(
             f"the server's actions cannot be executed: it announces {', '.join(unsupported)}",
             where=server,
-            expected="deltas of position and axis-angle, and a gripper that opens below 0 and else closes",
-            remedy="start GR00T's server with --args.invert_gripper; evaluate absolute actions, such as X-VLA's with "
-            "--args.benchmark_profile libero, by vla-eval's own LIBERO benchmark",
+            expected="position, axis-angle, and a gripper that opens below 0 and else closes",
+            remedy="start GR00T's server with --args.invert_gripper",
+        )
+    position = spec.get("position", {}).get("format")
+    announced = "absolute" if params.get("absolute_action") or position == "absolute_xyz" else "delta"
+    # A server may leave the format open.
+    if announced != actions and (announced == "absolute" or position == "delta_xyz"):
+        raise PipelineError(
+            f"the server announces {announced} actions, and the evaluation executes {actions} ones",
+            where=server,
+            expected="equal actions of server and evaluation",
+            remedy=f"evaluate with --actions {announced}; harness and lerobot-eval: the setting `actions: {announced}`",
         )

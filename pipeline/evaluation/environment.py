@@ -15,7 +15,7 @@ from pipeline.axes.base import Frozen
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import libero_plus, own_draws
-from pipeline.evaluation.actions import checked_actions
+from pipeline.evaluation.actions import Actions, checked_actions
 from pipeline.evaluation.policies import VIEWS, Wanted
 from pipeline.evaluation.results import REFUSED
 from pipeline.evaluation.simulator import Picture, Simulator
@@ -48,6 +48,8 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     # Fields that were added later are left out of an episode's name if they have their default: names stay equal.
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
     """views that are black, to test a policy without them"""
+    actions: Actions = Field(default="delta", exclude_if=lambda actions: actions == "delta")
+    """actions of the policy: deltas as in LIBERO, or goals in the world (``absolute``), as X-VLA's"""
     plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
     """training plan: held-out perturbations that are closer to it than their axis's clearance are sampled again.
     Results name the plan by the SHA-256 of its file."""
@@ -145,7 +147,8 @@ class EpisodeEnvironment:
 
         Args:
             action: (7,) deltas of position and axis-angle in [-1, 1], which the controller clips, and the gripper:
-                a number below 0 opens it, other numbers close it.
+                a number below 0 opens it, other numbers close it. With ``actions`` ``absolute``, the goal of the grip
+                site instead of the deltas: position in m and axis-angle in rad, in the world.
 
         Raises:
             PipelineError: if the action is not seven finite numbers, or if no episode is running.
@@ -159,7 +162,7 @@ class EpisodeEnvironment:
         steps = self.progress.steps + 1
         self._seen = {}
         try:
-            self.simulator.step(given)
+            self.simulator.step(given, absolute=self.settings.actions == "absolute")
             limited = "step_limit" if steps >= self.step_limit else "running"
             self.progress = Progress(steps, "success" if self.simulator.succeeded() else limited)
         except RefusedError as error:

@@ -17,7 +17,7 @@ from pipeline.axes import AXES
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
-from pipeline.evaluation.actions import PolicyError
+from pipeline.evaluation.actions import Actions, PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Policy, warn_of_single_view
 from pipeline.evaluation.results import one_setting
@@ -65,6 +65,10 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         raise PipelineError(
             f"only a server can observe every {settings.look_every} steps", where="look_every", expected="--server"
         )
+    if settings.actions == "absolute" and policy.kind in ("open_loop", "tracked"):
+        raise PipelineError(
+            "the replays of demonstrations execute deltas", where="actions", expected="--server or --checkpoint"
+        )
     selected = select(selection, evaluation.archive)
     check_settings(selection, selected, settings)
     evaluation.check(selected)
@@ -73,7 +77,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     if missing:
         if policy.kind == "server":
             # Each worker connects for itself. This connection warns once, before the workers start.
-            warn_of_single_view(policy.address, policy.timeout_s)
+            warn_of_single_view(policy.address, policy.timeout_s, settings.actions)
         device = gl.choose().device
         jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _jobs(missing, workers)]
         work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)
@@ -197,7 +201,7 @@ class EvaluationJob:
             )
         settings, archive = self.evaluation.settings, self.evaluation.archive
         environment = _environment(settings, archive)
-        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every)
+        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every, settings.actions)
         faults = {}
         # A lost worker may have finished some episodes of this job.
         for task in self._missing():
@@ -263,13 +267,13 @@ def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvi
 
 
 @lru_cache(maxsize=1)
-def _policy(policy_config: PolicyConfig, identity: str, look_every: int) -> Policy:
+def _policy(policy_config: PolicyConfig, identity: str, look_every: int, actions: Actions) -> Policy:
     """Return this process's policy.
 
     Raises:
         PipelineError: if it is not the policy with which the evaluation began.
     """
-    policy = policy_config.open(look_every)
+    policy = policy_config.open(look_every, actions)
     # The identity is computed after loading: files that changed before they were loaded still differ now.
     if policy_config.identity() != identity:
         raise PipelineError(

@@ -74,7 +74,8 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         self._evaluation, self._environment = evaluation, EpisodeEnvironment(settings, archive)
         self._max_episode_steps = settings.step_limit(tasks[0].suite)  # required by lerobot
         self.observation_space = observation_space(size_px)
-        self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float32)
+        limit = 1.0 if settings.actions == "delta" else np.inf
+        self.action_space = spaces.Box(-limit, limit, (7,), np.float32)
 
     @property
     def task(self) -> str:

@@ -14,6 +14,7 @@ from vla_eval.specs import (
     GRIPPER_CLOSE_POS,
     IMAGE_RGB,
     LANGUAGE,
+    POSITION_ABSOLUTE,
     POSITION_DELTA,
     ROTATION_AA,
     STATE_EEF_POS_AA_GRIP,
@@ -84,12 +85,12 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     ):
         super().__init__()
         del seed
-        refuse_other_actions({"absolute_action": absolute_action}, {}, "model server")
         self._selection = Selection.model_validate(selection or {})
         given = {"seed": self._selection.seed, "look_every": look_every}
         given |= {} if env_seed is None else {"fixture_seed": env_seed}
         self._archive = None if assets is None else Path(assets)
         episodes = EpisodeSettings.model_validate(given | (settings or {}))
+        refuse_other_actions({"absolute_action": absolute_action}, {}, "model server", episodes.actions)
         self._environment = EpisodeEnvironment(episodes, self._archive)
         self._evaluation: Evaluation | None = None
         if out is not None:
@@ -169,7 +170,8 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """Return the format of actions."""
-        return ACTION
+        absolute = self._environment.settings.actions == "absolute"
+        return {**ACTION, "position": POSITION_ABSOLUTE} if absolute else ACTION
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         """Return the format of observations."""

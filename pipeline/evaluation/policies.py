@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.evaluation.actions import PolicyError, checked_actions, refuse_other_actions
+from pipeline.evaluation.actions import Actions, PolicyError, checked_actions, refuse_other_actions
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum
 from pipeline.images.jpeg import resized
@@ -111,14 +111,14 @@ class Server:
         PipelineError: if no server answers at the address, or if its actions cannot be executed.
     """
 
-    def __init__(self, address: str, timeout_s: float = 120.0, look_every: int = 1):
+    def __init__(self, address: str, timeout_s: float = 120.0, look_every: int = 1, actions: Actions = "delta"):
         try:
             from vla_eval.connection import Connection
         except ImportError as error:
             raise PipelineError(
                 "the package vla-eval is not installed", remedy="pip install vla-eval==0.8.0"
             ) from error
-        self.name, self._next_look = address, NextLook(look_every)
+        self.name, self._next_look, self._actions = address, NextLook(look_every), actions
         self._loop = asyncio.new_event_loop()
         self._connection = Connection(address, timeout=timeout_s, max_retries=3)
         self._connect()
@@ -181,7 +181,7 @@ class Server:
         wanted = announced.get("observation_params") or {}
         self.states_request = any(name in wanted for name in REQUESTS)
         try:
-            refuse_other_actions(wanted, announced.get("action_spec") or {}, self.name)
+            refuse_other_actions(wanted, announced.get("action_spec") or {}, self.name, self._actions)
         except PipelineError:
             self.close()
             raise
@@ -212,17 +212,18 @@ class Server:
         return PolicyError(what, where=self.name, remedy="read the server's log")
 
 
-def warn_of_single_view(address: str, timeout_s: float) -> None:
+def warn_of_single_view(address: str, timeout_s: float, actions: Actions) -> None:
     """Log a warning if a server announces none of ``REQUESTS``, because its author may have forgotten it.
 
     Args:
         address: address of the server, such as ``ws://localhost:8000``.
         timeout_s: time limit of an answer.
+        actions: the actions that the evaluation executes.
 
     Raises:
         PipelineError: as ``Server``.
     """
-    with closing(Server(address, timeout_s)) as server:
+    with closing(Server(address, timeout_s, actions=actions)) as server:
         if not server.states_request:
             logging.getLogger(__name__).warning(
                 "%s announces neither %s: its policy receives only the agent view and the instruction. If the policy "

@@ -18,7 +18,7 @@ from pipeline.seeding import digest
 REFUSED = "refused"
 """Reason of an episode that could not begin, because its scene rejects the perturbation."""
 
-ALIKE = {"black": "none", "initial_states": "libero", "fixture_seed": 0}
+ALIKE = {"actions": "delta", "black": "none", "initial_states": "libero", "fixture_seed": 0}
 """Settings, and their values if a result leaves them out. Results on one suite of one source can be compared only if
 these settings, the prompt and the step limit are equal."""
 
@@ -192,7 +192,7 @@ def one_setting(results: Sequence[Stored]) -> dict[str, Any]:
 def refuse_different(results: Iterable[Stored], across: Collection[str] | None = None) -> None:
     """Reject results that cannot be compared.
 
-    In each suite of each source, results must have equal prompts, step limits, black views and starts.
+    In each suite of each source, results must have equal prompts, step limits, actions, black views and starts.
 
     Args:
         across: the settings that are compared and so may differ; `None` if the caller offers no such comparison.
@@ -211,7 +211,7 @@ def refuse_different(results: Iterable[Stored], across: Collection[str] | None =
     _agree(
         ((f"{row.source}/{row.suite}", alike(row), files.path(row.episode)) for row, files in results),
         "these results cannot be compared on ",
-        expected="one prompt, one step limit, the same black views and starts for all that is compared",
+        expected="equal prompts, step limits, actions, black views and starts of all compared results",
         remedy=f"evaluate both with equal settings, or leave one of the folders out{'' if across is None else choice}",
     )
 

@@ -18,7 +18,7 @@ from pipeline.axes.base import Frozen
 from pipeline.axes.component_names import stored_names
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, own_draws
-from pipeline.evaluation.actions import checked_actions
+from pipeline.evaluation.actions import Actions, checked_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
@@ -88,11 +88,11 @@ class PolicyConfig(Frozen, use_attribute_docstrings=True):
         scripts = {"open_loop": "replay", "tracked": "tracked replay"}
         return self.label or scripts.get(self.kind) or f"{self.address} {identity.removeprefix('sha256:')[:8]}"
 
-    def open(self, look_every: int) -> Policy:
+    def open(self, look_every: int, actions: Actions) -> Policy:
         """Load the policy, or connect to its server."""
         match self.kind:
             case "server":
-                return Server(self.address, self.timeout_s, look_every)
+                return Server(self.address, self.timeout_s, look_every, actions)
             case "checkpoint":
                 return Checkpoint(Path(self.address))
             case "open_loop":

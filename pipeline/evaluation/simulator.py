@@ -152,8 +152,12 @@ class Simulator(Environment):
         self._control_step = ControlStep(env)
         self.observed = self._observe(env.sim.data.qpos.copy())
 
-    def step(self, action: Floats) -> None:
+    def step(self, action: Floats, absolute: bool = False) -> None:
         """Run one control step (50 ms), and store LIBERO's observation of it in ``observed``.
+
+        Args:
+            action: (7,) deltas and gripper, or the controller's goal and gripper.
+            absolute: true if the action is a goal.
 
         Raises:
             RefusedError: ``simulation_unstable`` if numbers grow too large to compute with, and if MuJoCo has reset the
@@ -161,6 +165,7 @@ class Simulator(Environment):
         """
         data = self._env.sim.data._data
         qpos = data.qpos.copy()
+        self.controller.use_delta = not absolute
         self._act_from_outside()
         with self._stable():
             for number, _ in enumerate(self._control_step.substeps(action), start=1):

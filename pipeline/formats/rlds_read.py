@@ -216,6 +216,7 @@ def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> 
         state=steps["observation/state"],
         joint_state=steps["observation/joint_state"],
         action=steps["action"],
+        action_absolute=steps["action_absolute"],
         instruction=instructions[0],
         provenance={name: _said(steps[METADATA + name][0]) for name in provenance_of(extras)},
         geometry={view: _geometry(steps, view, extras) for view in SCHEMA.views},

@@ -105,6 +105,7 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     step = {
         "observation": observation,
         "action": _tensor(SCHEMA.action),
+        "action_absolute": _tensor(SCHEMA.action_absolute),
         "discount": scalar(np.float32, doc="always 1"),
         "reward": scalar(np.float32, doc="always 0" if failures else "1 on the last step, else 0"),
         "is_first": scalar(np.bool_, doc="first step of the episode"),
@@ -159,6 +160,7 @@ def _nested_example(episode: Episode) -> dict[str, Any]:
         step = {
             "observation": {name: values[t] for name, values in columns.items()},
             "action": episode.action[t],
+            "action_absolute": episode.action_absolute[t],
             "discount": 1.0,
             "reward": float(success and t == last),
             "is_first": t == 0,

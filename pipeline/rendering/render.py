@@ -7,6 +7,7 @@ perturb, restore, render, add noise, turn.
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA, named
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import encode, to_policy
+from pipeline.physics.controller_goals import absolute_actions, grip_path
 from pipeline.planning.streams import Stream
 from pipeline.rendering.geometry import Instances, see
 from pipeline.rendering.renderer import LastScene, Renderer
@@ -44,6 +46,13 @@ def render(
         if instances:
             poses.append(instances.poses(renderer.data))
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
+
+    def restored(state: Floats) -> mujoco.MjData:
+        renderer.restore(state, trajectory.site_alpha[0])
+        return renderer.data
+
+    path = grip_path(trajectory.scene, trajectory.states[:-1], restored)
+    goals = absolute_actions(trajectory.actions, path)
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
     encoded: dict[str, list[Jpeg]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}
@@ -62,6 +71,7 @@ def render(
         state=state,
         joint_state=joint_state,
         action=trajectory.actions.astype(np.float32),
+        action_absolute=goals.astype(np.float32),
         streams={stream_id: frames for stream_id, frames in encoded.items() if stream_id not in rejected},
         rejected=rejected,
         geometry={view.stream_id: see(renderer, trajectory, view, instances, render_config.extras) for view in views},

@@ -54,6 +54,7 @@ class EpisodeLoader:
             state=rendered.state,
             joint_state=rendered.joint_state,
             action=rendered.action,
+            action_absolute=rendered.action_absolute,
             instruction=row.instruction,
             provenance={name: values[name] for name in provenance_of(self.extras)},
             geometry={view: rendered.geometry[name] for view, name in geometry.items()},

@@ -75,10 +75,10 @@ class RenderJob:
         """
         trajectory = self._trajectory()
         action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
-        state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)
+        state, seven = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)
         parts, missing = self._stored()
         rejected = {stream.stream_id: LOST for stream in missing}
-        self._save([*parts, Rendered(trajectory.mode, state, joint_state, action, rejected=rejected)])
+        self._save([*parts, Rendered(trajectory.mode, state, seven, action, seven, rejected=rejected)])
 
     def _trajectory(self) -> Trajectory:
         return TrajectoryStore(self.trajectories).load(self.row.trajectory_id)

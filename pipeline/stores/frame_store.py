@@ -93,6 +93,7 @@ class FrameStore(Store):
             "state": rendered.state,
             "joint_state": rendered.joint_state,
             "action": rendered.action,
+            "action_absolute": rendered.action_absolute,
         }
         for stream_id, frames in sorted(rendered.streams.items()):
             arrays |= _packed(f"streams/{stream_id}", frames)
@@ -231,6 +232,7 @@ def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[s
         state=file.array("state"),
         joint_state=file.array("joint_state"),
         action=file.array("action"),
+        action_absolute=file.array("action_absolute"),
         streams={name: [*map(Jpeg, _unpacked(file, f"streams/{name}"))] for name in streams},
         rejected=json.loads(file.attributes["rejected"]),
         geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},

@@ -6,6 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
@@ -67,6 +68,13 @@ ARM = slice(1, 8)
 """Joint angles in a flattened state, after the time: LIBERO's robot comes first in every scene."""
 
 
+GRIP_IN_HAND = Rotation.from_euler("z", -90, degrees=True)
+"""Orientation of the grip site, which the controller moves, in the hand, whose orientation the state has."""
+
+GOAL_TOLERANCE = 1e-5
+"""Largest difference of goals in m and rad; state and goal are rounded to float32."""
+
+
 def motion(case: Case) -> Iterator[Fault]:
     """Check actions, states and joint angles, bit for bit; actions and joint angles must be the replay's."""
     replay = case.trajectory
@@ -74,6 +82,8 @@ def motion(case: Case) -> Iterator[Fault]:
         yield case.finding("frames", "has other joint angles", "the joint angles of the replay")
     if not _same(case.made.action, replay.actions.astype(np.float32)):
         yield case.finding("frames", "has other actions", "the actions of the replay")
+    else:
+        yield from _goals(case)
     for copy in case.copies:
         # Copies of another length cannot be compared; ``length`` reports them.
         for name in MOTION if len(copy) == len(case.made) else ():
@@ -85,6 +95,26 @@ def motion(case: Case) -> Iterator[Fault]:
                 step = next(t for t in range(len(made)) if not _same(values[t], made[t]))
                 what = f"{name} of step {step} is {values[step].tolist()}"
                 yield case.finding(copy.dataset, what, made[step].tolist())
+
+
+def _goals(case: Case) -> Iterator[Fault]:
+    """Compare the absolute actions with state and delta of their step.
+
+    The goal of the orientation is compared at steps that turn the hand; at others, it is a former goal.
+    """
+    made, spec = case.made, SCHEMA.action
+    deltas = np.clip(made.action[:, :6].astype(float), *spec.range) * np.repeat([spec.unit_m, spec.unit_rad], 3)
+    goals = made.action_absolute.astype(float)
+    positions_m = made.state[:, :3] + deltas[:, :3]
+    turns = np.any(deltas[:, 3:] != 0, axis=1)
+    hands = Rotation.from_rotvec(made.state[:, 3:6]) * GRIP_IN_HAND
+    apart = Rotation.from_rotvec(goals[:, 3:6]).inv() * Rotation.from_rotvec(deltas[:, 3:]) * hands
+    if np.abs(goals[:, :3] - positions_m).max() > GOAL_TOLERANCE:
+        yield case.finding("frames", "action_absolute has other positions", "state plus delta")
+    if np.any(apart.magnitude()[turns] > GOAL_TOLERANCE):
+        yield case.finding("frames", "action_absolute has other orientations", "state turned by delta")
+    if not _same(made.action_absolute[:, 6], made.action[:, 6]):
+        yield case.finding("frames", "action_absolute has other gripper commands", "those of action")
 
 
 def instruction(case: Case) -> Iterator[Fault]:

@@ -226,7 +226,9 @@ def _frames() -> bytes:
             "one": [Jpeg(bytes([n]) * 200) for n in range(20)],
             "two": [Jpeg(bytes([n]) * 90) for n in range(20)],
         }
-        store.save("frames", Rendered("open_loop", state, joints, action, streams, {"three": "too_dark"}), "llvmpipe")
+        store.save(
+            "frames", Rendered("open_loop", state, joints, action, action, streams, {"three": "too_dark"}), "llvmpipe"
+        )
         (name,) = store.names()
         return store.path(name)
 

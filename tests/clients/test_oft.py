@@ -49,6 +49,7 @@ def episode(name: str) -> Episode:
         state=state,
         joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
         action=action,
+        action_absolute=action,
         instruction=f"Put the bowl {name} on the plate",
         provenance={
             column: dict[str, Any](string="", int64=0, float32=0.0)[dtype]
@@ -152,6 +153,7 @@ def first(made: Episode, steps: int) -> Episode:
     return replace(
         made,
         action=made.action[:steps],
+        action_absolute=made.action_absolute[:steps],
         state=made.state[:steps],
         joint_state=made.joint_state[:steps],
         frames={view: frames[:steps] for view, frames in made.frames.items()},

@@ -59,6 +59,7 @@ def demonstration(episode_id: str) -> Episode:
     return replace(
         small,
         action=action,
+        action_absolute=action,
         state=np.resize(small.state, (steps, 8)),
         joint_state=np.resize(small.joint_state, (steps, 7)),
         frames={view: [frames[0]] * steps for view, frames in small.frames.items()},

@@ -51,12 +51,15 @@ def test_a_server_of_other_actions_is_refused(monkeypatch: pytest.MonkeyPatch) -
             _, port = portal.start_task(serve_async, server, "127.0.0.1", 0)
             return f"ws://127.0.0.1:{port}"
 
-        for server, told in (
-            (GR00TModelServer(invert_gripper=True, observation_params=XVLA["libero"]), "announces absolute_action"),
-            (GR00TModelServer(), "announces gripper continuous_01"),
-        ):
-            with pytest.raises(PipelineError, match=f"{told}(?s:.*)args.invert_gripper"):
-                Server(address(server))
+        with pytest.raises(PipelineError, match=r"announces gripper continuous_01(?s:.*)args\.invert_gripper"):
+            Server(address(GR00TModelServer()))
+        xvla = address(GR00TModelServer(invert_gripper=True, observation_params=XVLA["libero"]))
+        with pytest.raises(PipelineError, match=r"announces absolute actions(?s:.*)--actions absolute"):
+            Server(xvla)
+        Server(xvla, actions="absolute").close()
+        deltas = address(GR00TModelServer(invert_gripper=True))
+        with pytest.raises(PipelineError, match=r"announces delta actions(?s:.*)--actions delta"):
+            Server(deltas, actions="absolute")
         asked = {"send_wrist_image": True, "quat_no_antipodal": True}
         for params, wanted in ((None, Wanted(wrist=False, shortest_rotation=True)), (asked, Wanted())):
             with closing(Server(address(GR00TModelServer(invert_gripper=True, observation_params=params)))) as taken:

@@ -92,7 +92,7 @@ def short() -> Any:
 
 
 def test_the_harness_refuses_absolute_actions() -> None:
-    with pytest.raises(PipelineError, match="absolute_action"):
+    with pytest.raises(PipelineError, match="--actions absolute"):
         PerturbedLibero(absolute_action=True)
 
 

@@ -159,7 +159,7 @@ def test_a_server_that_does_not_ask_is_warned_of(
     params: dict[str, bool], warned: bool, serve: Serve, caplog: pytest.LogCaptureFixture
 ) -> None:
     address = serve(Asking(**params))
-    warn_of_single_view(address, timeout_s=10)
+    warn_of_single_view(address, timeout_s=10, actions="delta")
     told = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(told) == warned
     for message in told:

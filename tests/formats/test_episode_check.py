@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from synthetic import IDS, episode, files, with_extras, write_lerobot, write_rlds
 
-from pipeline.episode_schema import SCHEMA, check
+from pipeline.episode_schema import MOTION, SCHEMA, check
 from pipeline.errors import PipelineError
 from pipeline.types import Episode, Jpeg
 
@@ -41,7 +41,7 @@ def test_a_frame_that_is_no_whole_jpeg_is_refused(change: Callable[[bytes], byte
 
 def truncated(source: Episode, steps: int) -> Episode:
     frames = {view: frames[:steps] for view, frames in source.frames.items()}
-    arrays = {name: getattr(source, name)[:steps] for name in ("state", "joint_state", "action")}
+    arrays = {name: getattr(source, name)[:steps] for name in MOTION}
     return replace(source, frames=frames, **arrays)
 
 

@@ -55,6 +55,7 @@ def test_formats_carry_the_same_numbers(written: Written) -> None:
         rows = [row for row, found in enumerate(table["episode_index"]) if found == index]
         for name, key in (
             ("action", "action"),
+            ("action_absolute", "absolute_action"),
             ("state", "observation.state"),
             ("joint_state", "observation.joint_state"),
         ):

@@ -68,6 +68,7 @@ def test_rlds_features_are_openvlas(written: Written) -> None:
     text = ((), np.dtype(object))
     assert specs == {
         "action": ((7,), np.float32),
+        "action_absolute": ((7,), np.float32),
         "discount": ((), np.float32),
         "reward": ((), np.float32),
         "is_first": ((), np.bool_),

@@ -352,7 +352,7 @@ def stills(steps: int) -> Episode:
     """Frames with the step in their grey level."""
     frames = [encode(np.full((256, 256, 3), 8 * step, np.uint8), STARTER.render.jpeg_quality) for step in range(steps)]
     nothing = np.zeros((steps, 7), np.float32)
-    return Episode("", {"image": frames}, nothing, nothing, nothing, "", {}, {})
+    return Episode("", {"image": frames}, nothing, nothing, nothing, nothing, "", {}, {})
 
 
 def of_run(name: str, twin: str, change: Perturbation | None = None, reason: str = "kept") -> dict[str, Any]:

@@ -137,7 +137,7 @@ def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:
     state, motion = np.zeros((1, 8), np.float32), np.zeros((1, 7), np.float32)
     rendered = Rendered(
         "open_loop",
-        *(state, motion, motion),
+        *(state, motion, motion, motion),
         streams={**{one.stream_id: [clean] for one in twins.values()}, noisy["image"].stream_id: [lighter]},
         geometry={one.geometry.stream_id: view for one in (*twins.values(), *noisy.values())},
         quality=Quality(**dict.fromkeys((each.name for each in fields(Quality)), 0)),

@@ -18,6 +18,7 @@ def test_only_the_streams_asked_for_and_of_the_same_device_are_taken_over(tmp_pa
         np.zeros((1, 8), np.float32),
         motion,
         motion,
+        motion,
         streams={"seen": [Jpeg(b"frame")], "other": [Jpeg(b"other")]},
         rejected={"black": "too_dark", "bright": "blown_out"},
         geometry={"view": view},

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from conftest import BOWL, run_in
+from numpy.typing import NDArray
 from synthetic import IDS, episode
 
 from pipeline.axes import Axes, to_json
@@ -39,12 +40,22 @@ def case(**row: Any) -> Case:
     return Case(row, MADE, replay, [], None)
 
 
+def moved(entry: int) -> NDArray[np.float32]:
+    """The absolute actions, of which one entry is moved by 0.1 mm or 0.1 mrad at one step."""
+    goals = MADE.action_absolute.copy()
+    goals[5, entry] += 1e-4
+    return goals
+
+
 def test_frames_of_another_motion_than_the_replays_are_found() -> None:
     whole = case()
     assert list(CHECKS["motion"](whole)) == []
     for spoilt, what in (
         (replace(MADE, action=np.roll(MADE.action, 1, axis=0)), "has other actions"),
         (replace(MADE, joint_state=np.roll(MADE.joint_state, 1, axis=0)), "has other joint angles"),
+        (replace(MADE, action_absolute=moved(0)), "action_absolute has other positions"),
+        (replace(MADE, action_absolute=moved(4)), "action_absolute has other orientations"),
+        (replace(MADE, action_absolute=moved(6)), "action_absolute has other gripper commands"),
     ):
         (fault,) = CHECKS["motion"](replace(whole, made=spoilt))
         assert (fault.dataset, fault.what) == ("frames", what)

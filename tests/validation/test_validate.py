@@ -224,7 +224,7 @@ def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory])
     state = np.zeros((len(action), 8), np.float32)
     state[:, 6:] = trajectory.states[:-1, 8:10]
     joints = np.zeros((len(action), 7), np.float32)
-    made = Episode("milk", {}, state, joints, action, "", {}, {})
+    made = Episode("milk", {}, state, joints, action, action, "", {}, {})
 
     def found(sign: float) -> list[Fault]:
         commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)

@@ -11,10 +11,10 @@ import pyarrow as pa
 from packaging.version import Version
 from pydantic import Field, field_validator
 
-from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, GripperSpec
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, GripperSpec
 from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
-from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Convention, camera_column
+from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Action, Convention, camera_column
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
 from pipeline.tables import column
@@ -34,6 +34,8 @@ class LeRobotConfig(FormatOptions):
             ``video`` by default.
         validation: Share of each task's demonstrations in the split ``val``, whose episodes come last, 0 or 0.001 to
             0.5; 0 by default.
+        action: Content of the column ``action``, on which policies train: ``delta``, the controller's input, or
+            ``absolute``, its goal; ``delta`` by default. The other one is in ``absolute_action`` or ``delta_action``.
         language: True adds the task's rewrites and the current subtask to every frame, in lerobot's language column;
             false by default. Versions of lerobot before 0.6 cannot read such a dataset.
     """
@@ -43,7 +45,8 @@ class LeRobotConfig(FormatOptions):
     shards: Count | None = Field(default=None, serialization_alias="parts")
     frames: Literal["video", "images"] = "video"
     validation: Share = 0.0
-    # Excluded at its default, as ``lerobot_v21``.
+    # Excluded at their defaults, as ``lerobot_v21``.
+    action: Action = Field(default="delta", exclude_if=lambda action: action == "delta")
     language: bool = Field(default=False, exclude_if=lambda language: not language)
 
     @field_validator("language")
@@ -67,7 +70,7 @@ class LeRobot(Format[LeRobotConfig]):
     title: ClassVar = "LeRobot"
     options_type: ClassVar = LeRobotConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 8
+    recipe: ClassVar = 9
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = "lerobot"
     rewrites_instructions: ClassVar = True
@@ -77,11 +80,15 @@ class LeRobot(Format[LeRobotConfig]):
     )
     keys = (
         {view: spec.lerobot_key for view, spec in SCHEMA.views.items()}
-        | {name: getattr(SCHEMA, name).lerobot_key for name in MOTION}
+        | Convention("video").motion_keys
         | {f"{view}_{name}": camera_column(view, name) for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
         | {"provenance": "meta/provenance.parquet"}
     )
     clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
+
+    def __init__(self, data: Path, options: LeRobotConfig, extras: Sequence[Extra] = ()) -> None:
+        super().__init__(data, options, extras)
+        self.keys = {**LeRobot.keys, **self._convention.motion_keys}
 
     @property
     def language(self) -> bool:
@@ -89,7 +96,7 @@ class LeRobot(Format[LeRobotConfig]):
 
     @property
     def _convention(self) -> Convention:
-        return Convention(self.options.frames, language=self.language)
+        return Convention(self.options.frames, language=self.language, action=self.options.action)
 
     @property
     def root(self) -> Path:
@@ -150,7 +157,7 @@ class LeRobot(Format[LeRobotConfig]):
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats.lerobot import read
 
-        return read.read(self.root, row["episode_id"], self.extras)
+        return read.read(self.root, row["episode_id"], self.extras, self._convention)
 
     def repository_path(self, file: str) -> str:
         # lerobot reads a dataset from the root of the repository.
@@ -232,7 +239,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     name: ClassVar = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
     options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
-    recipe: ClassVar = 3
+    recipe: ClassVar = 4
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = LeRobot.group
     step_s: ClassVar = LeRobot.step_s

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MOTION, SCHEMA
+from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot.columns import (
     DATA_PATH,
@@ -101,7 +101,7 @@ def check(
         stored = (data.meta.total_episodes, data.num_frames)
         wrong = list(_wrong_statistics(root, convention, extras))
         split_of = _split_of(root, episodes)
-        samples = list(_samples(root, data))
+        samples = list(_samples(root, data, convention))
     for what, expected in wrong:
         yield "format", Fault("lerobot", None, what, expected)
     for episode_id, key in samples:
@@ -215,17 +215,16 @@ def _wrong_statistics(root: Path, convention: Convention, extras: Sequence[Extra
         yield from _wrong_frames(column, stored[column], of_episodes)
 
 
-def _samples(root: Path, data: Any) -> Iterator[tuple[str, str]]:
+def _samples(root: Path, data: Any, convention: Convention) -> Iterator[tuple[str, str]]:
     """List each episode and column in which lerobot and ``copy_of`` differ at the sampled steps."""
     episodes = sorted(rows(root).values(), key=lambda row: row["episode_index"])
     places = {round(place) for place in np.linspace(0, len(episodes) - 1, BY_LEROBOT)}
     for place in sorted(places):
         row = episodes[place]
-        copy = copy_of(root, row, ())
+        copy = copy_of(root, row, (), convention)
         for step in sampled(row["length"]):
             item = data[row["dataset_from_index"] + step]
-            for name in MOTION:
-                key = getattr(SCHEMA, name).lerobot_key
+            for name, key in convention.motion_keys.items():
                 if not np.array_equal(item[key].numpy(), getattr(copy.episode, name)[step]):
                     yield row[EPISODE_ID], key
             for view, spec in SCHEMA.views.items():

@@ -133,6 +133,13 @@ def read_matrix(file: Path, column: str) -> NDArray[Any]:
     return matrix(pq.ParquetFile(file).read([column], use_threads=False), column)
 
 
+Action = Literal["delta", "absolute"]
+"""Content of the column ``action``, on which policies train."""
+
+_ABSOLUTE_KEYS = {"action": "delta_action", "action_absolute": "action"}
+"""Columns that exchange their content; lerobot would take every column that begins with ``action`` as an action."""
+
+
 @dataclass(frozen=True)
 class Convention:
     """Layout of a set that clients expect.
@@ -151,6 +158,13 @@ class Convention:
     names: Mapping[str, str] = field(default_factory=dict)
     open_is_one: bool = False
     language: bool = False
+    action: Action = "delta"
+
+    @property
+    def motion_keys(self) -> dict[str, str]:
+        """Map each array of ``MOTION`` to its column in v3.0; policies train on the column ``action``."""
+        keys = {name: getattr(SCHEMA, name).lerobot_key for name in MOTION}
+        return keys | _ABSOLUTE_KEYS if self.action == "absolute" else keys
 
     def name(self, column: str) -> str:
         """Return the name of a column of v3.0."""
@@ -169,9 +183,9 @@ class Convention:
             frame["dtype"] = "image"
         text, number = ({"dtype": dtype, "shape": (1,), "names": None} for dtype in ("string", "int64"))
         columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
-        for name in MOTION:
+        for name, key in self.motion_keys.items():
             spec = getattr(SCHEMA, name)
-            columns[spec.lerobot_key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
+            columns[key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
         columns[EPISODE_ID] = dict(text)
         maps = [name for name in MAPS if name in extras]
         columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in maps}

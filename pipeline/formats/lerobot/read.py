@@ -55,7 +55,7 @@ NUMBERS = ("float32", "int64")
 """Types of the columns that have statistics, in addition to frames."""
 
 
-def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
+def read(root: Path, episode_id: str, extras: tuple[Extra, ...], convention: Convention) -> Copy | None:
     """Read an episode with these extras; ``None`` when the dataset does not have it.
 
     Raises:
@@ -63,7 +63,7 @@ def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
     """
     with readable(root):
         row = rows(root).get(episode_id)
-        return None if row is None else copy_of(root, row, extras)
+        return None if row is None else copy_of(root, row, extras, convention)
 
 
 @contextmanager
@@ -108,7 +108,7 @@ def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
     return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
 
 
-def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy:
+def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...], convention: Convention) -> Copy:
     """Read an episode, given its row of ``rows``."""
     index, steps = row["episode_index"], row["length"]
     info, _ = _opened(edition(root / "meta" / "info.json"))
@@ -131,7 +131,7 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
             videos[view] = path, first_s
     return Copy(
         dataset="lerobot",
-        episode=episode(table, row, instructions[0], extras),
+        episode=episode(table, row, instructions[0], extras, convention),
         instructions=instructions,
         decoded=decoded(table["timestamp"].to_pylist(), videos),
         marks={name: table[name].to_numpy() for name in MARKS},
@@ -192,7 +192,9 @@ def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
             raise ValueError(f"by {name}, these are not the {steps} steps of episode {index}")
 
 
-def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...]) -> Episode:
+def episode(
+    table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...], convention: Convention
+) -> Episode:
     """Return an episode, given v3.0's columns of its steps and its row of ``meta/provenance.parquet``.
 
     The episode has frames only where they are stored as image files.
@@ -201,12 +203,14 @@ def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: t
     for view, spec in SCHEMA.views.items():
         if spec.lerobot_key in table.column_names:
             frames[view] = [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
+    motion = {name: matrix(table, key) for name, key in convention.motion_keys.items()}
     return Episode(
         episode_id=row[EPISODE_ID],
         frames=frames,
-        state=matrix(table, SCHEMA.state.lerobot_key),
-        joint_state=matrix(table, SCHEMA.joint_state.lerobot_key),
-        action=matrix(table, SCHEMA.action.lerobot_key),
+        state=motion["state"],
+        joint_state=motion["joint_state"],
+        action=motion["action"],
+        action_absolute=motion["action_absolute"],
         instruction=instruction,
         provenance=row,
         geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},
@@ -346,10 +350,9 @@ def _copy_v21(
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
     v30_names = {name: v30_name for v30_name, name in convention.names.items()}
     table = stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
-    made = episode(table, row, instructions[0], extras)
+    made = episode(table, row, instructions[0], extras, convention)
     if convention.open_is_one:
-        libero_gripper = 1 - 2 * made.action[:, -1:]
-        made = replace(made, action=np.hstack([made.action[:, :-1], libero_gripper]))
+        made = replace(made, action=_libero_gripper(made.action), action_absolute=_libero_gripper(made.action_absolute))
     keys = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
     videos = {
         view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"
@@ -359,6 +362,11 @@ def _copy_v21(
     statistics = Statistics(_statistics_v21(root, index), numbers, keys)
     frames = decoded(table["timestamp"].to_pylist(), videos)
     return Copy(root.parent.name, made, instructions, frames, marks, {}, statistics=statistics)
+
+
+def _libero_gripper(action: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Convert the gripper command of actions (T, 7) from 1 open, 0 close to LIBERO's -1 open, 1 close."""
+    return np.hstack([action[:, :-1], 1 - 2 * action[:, -1:]])
 
 
 def _statistics_v21(root: Path, index: int) -> dict[str, Any]:

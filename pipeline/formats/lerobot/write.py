@@ -33,7 +33,7 @@ import pyarrow.parquet as pq
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, check, named, provenance_of
+from pipeline.episode_schema import MATRICES, SCHEMA, check, named, provenance_of
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, listed, of_levels, open_is_one
@@ -162,8 +162,12 @@ def _load_each(
         episode = load(episode_id)
         check(episode, extras)
         if convention.open_is_one:
-            episode = replace(episode, action=open_is_one(episode.action))
-        yield index, first_step, episode, _numbers(episode, index, first_step, piece.tasks[episode.instruction])
+            episode = replace(
+                episode,
+                action=open_is_one(episode.action),
+                action_absolute=open_is_one(episode.action_absolute),
+            )
+        yield index, first_step, episode, _numbers(episode, index, first_step, piece, convention)
         first_step += len(episode)
 
 
@@ -200,9 +204,9 @@ def _append_frames(episode: Episode, view: str, video: Video | None) -> Counts:
     return counts
 
 
-def _numbers(episode: Episode, index: int, first_step: int, task: int) -> Numbers:
-    steps = np.arange(len(episode))
-    numbers: dict[str, NDArray[Any]] = {getattr(SCHEMA, name).lerobot_key: getattr(episode, name) for name in MOTION}
+def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, convention: Convention) -> Numbers:
+    steps, task = np.arange(len(episode)), piece.tasks[episode.instruction]
+    numbers: dict[str, NDArray[Any]] = {key: getattr(episode, name) for name, key in convention.motion_keys.items()}
     if episode.object_poses is not None:
         numbers[OBJECT_POSES] = episode.object_poses.reshape(len(steps), -1)
     return numbers | {

@@ -1,0 +1,49 @@
+"""LeRobot datasets store each action as a delta and as a goal; policies train on the one that was chosen."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.configs.types import FeatureType
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import dataset_to_policy_features
+from synthetic import IDS, NAME, episode, episodes, loop
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig
+from pipeline.run.export import export
+
+
+@pytest.mark.parametrize(
+    ("choice", "trained", "other"),
+    [
+        ("delta", "action", "absolute_action"),
+        ("absolute", "action_absolute", "delta_action"),
+    ],
+)
+def test_policies_train_on_the_chosen_actions(choice: str, trained: str, other: str, tmp_path: Path) -> None:
+    options = LeRobotConfig.model_validate({"name": NAME, "action": choice})
+    target = LeRobot(tmp_path, options)
+    export(target, episodes(), loop)
+    written = [episode(episode_id) for episode_id in IDS]
+    expected = np.concatenate([getattr(one, trained) for one in written])
+    beside = np.concatenate([one.action_absolute if choice == "delta" else one.action for one in written])
+    dataset = LeRobotDataset(NAME, root=target.root, video_backend="pyav")
+    np.testing.assert_array_equal(np.stack(dataset.hf_dataset.with_format("numpy")["action"]), expected)
+    np.testing.assert_array_equal(np.stack(dataset.hf_dataset.with_format("numpy")[other]), beside)
+    features = dataset_to_policy_features(dataset.meta.features)
+    assert [name for name, feature in features.items() if feature.type is FeatureType.ACTION] == ["action"]
+    assert dataset.meta.features["action"]["names"] == list(getattr(SCHEMA, trained).names)
+    np.testing.assert_allclose(dataset.meta.stats["action"]["mean"], expected.mean(axis=0), atol=1e-6)
+    modality = json.loads((target.root / "meta" / "modality.json").read_text())
+    assert {entry["original_key"] for entry in modality["action"].values()} == {"action"}
+    rows = {
+        one.episode_id: {"episode_id": one.episode_id, "demo_id": "task/demo", "steps": len(one)} for one in written
+    }
+    assert [fault.what for _, fault in target.check(rows, tmp_path / "cache")] == []
+    for one in written:
+        copy = target.read(rows[one.episode_id], tmp_path / "cache")
+        assert copy is not None
+        np.testing.assert_array_equal(copy.episode.action, one.action)
+        np.testing.assert_array_equal(copy.episode.action_absolute, one.action_absolute)

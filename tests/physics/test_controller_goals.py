@@ -1,0 +1,49 @@
+"""Absolute actions are the goals that robosuite's own controller gets from the deltas."""
+
+import numpy as np
+import pytest
+from conftest import STOVE, starter_demo
+from scipy.spatial.transform import Rotation
+
+from pipeline.axes import PhysicsPerturbation
+from pipeline.axes.robot import RobotAxis
+from pipeline.config import ReplayConfig
+from pipeline.physics.controller_goals import GripPath, absolute_actions
+from pipeline.physics.environment import Environment
+from pipeline.physics.replay import replay
+from pipeline.seeding import rng
+
+
+def robot_start(component: str) -> PhysicsPerturbation:
+    axis = RobotAxis.model_validate({"components": [component], "levels": [3]})
+    perturbation = axis.sample(rng("goals", component), STOVE, 0)
+    assert isinstance(perturbation, PhysicsPerturbation)
+    return perturbation
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("component", ["", "controller_posture", "initial_joints"])
+def test_goals_are_those_of_robosuites_controller(component: str) -> None:
+    """Also where the first actions do not turn the hand, and the controller keeps the posture of a changed reset."""
+    environment = Environment(STOVE)
+    changes = (robot_start(component),) if component else ()
+    trajectory = replay(environment, starter_demo(STOVE), "t", ReplayConfig(mode="open_loop"), changes)
+    # A few steps without a turn, at the beginning and later, as LIBERO's recordings have them.
+    actions = trajectory.actions[:40].copy()
+    actions[[0, 1, 2, 20, 21], 3:6] = 0.0
+    environment.restore(trajectory.scene)
+    environment.settle(10)
+    controller = environment._env.env.robots[0].controller
+    states, positions_m, rotations = [], [], []
+    for action in actions:
+        states.append(environment.state)
+        environment.step(action)
+        positions_m.append(controller.goal_pos.copy())
+        rotations.append(controller.goal_ori.copy())
+    goals = absolute_actions(actions, GripPath.of(trajectory.scene, np.stack(states)))
+    np.testing.assert_allclose(goals[:, :3], positions_m, atol=1e-9)
+    turned_rad = (Rotation.from_rotvec(goals[:, 3:6]).inv() * Rotation.from_matrix(rotations)).magnitude()
+    assert turned_rad.max() < 1e-6
+    assert np.array_equal(goals[:, 6], actions[:, 6])
+    held_rad = (Rotation.from_rotvec(goals[2, 3:6]).inv() * Rotation.from_rotvec(goals[0, 3:6])).magnitude()
+    assert held_rad < 1e-9, "a goal stays through steps without a turn"
