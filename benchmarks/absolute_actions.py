@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from repeat_in_libero import STEP_S, Done, _of_run, opened, put_in
+from repeat_in_libero import STEP_S, Done, of_run, opened, put_in
 
 from pipeline.machine_code import ensure_fixed_machine_code
-from pipeline.physics.controller_goals import GripPath, absolute_actions
+from pipeline.physics.controller_goals import absolute_actions, replayed_grips
 from pipeline.types import Floats
 
 
@@ -31,14 +31,15 @@ def main() -> None:
     arguments = parser.parse_args()
     env, task = None, None
     distances_m, tried, reached = [], 0, 0
-    for done in islice(_of_run(arguments.data), arguments.limit):
+    for done in islice(of_run(arguments.data), arguments.limit):
         if task != done.task:
             env = opened(done.task)
         task = done.task
-        path = GripPath.of(done.scene, done.states)
-        goals = absolute_actions(done.actions, path).astype(np.float32)
+        first_grip, grips = replayed_grips(done.scene, done.states)
+        goals = absolute_actions(done.actions, first_grip, grips[:-1]).astype(np.float32)
         success, hand_m = executed(env, done, goals.astype(float))
-        distance_m = float(np.linalg.norm(hand_m - path.positions_m[1:], axis=1).max())
+        replayed_m = np.stack([grip.position_m for grip in grips[1:]])
+        distance_m = float(np.linalg.norm(hand_m - replayed_m, axis=1).max())
         tried, reached = tried + 1, reached + success
         distances_m.append(distance_m)
         if not success:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import pipeline
 import pipeline.run.render_job
@@ -25,8 +24,9 @@ from pipeline.axes import PhysicsPerturbation
 from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode
-from pipeline.physics.controller_goals import GripPath, absolute_actions
+from pipeline.physics.controller_goals import absolute_actions
 from pipeline.planning.streams import Stream
+from pipeline.scenes.compiled import GripPose
 from pipeline.types import Demo, Frame, Geometry, Jpeg, Rendered, Scene, Task, Trajectory, Verdict
 from pipeline.validation.checks import ARM, GRIP_IN_HAND
 
@@ -76,14 +76,14 @@ def render(
     fixed = Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
     state = np.zeros((steps, 8), np.float32)
     state[:, 6:] = 0.04, -0.04
-    grips = Rotation.concatenate([GRIP_IN_HAND] * steps)
-    path = GripPath(np.zeros((steps, 3)), grips, GRIP_IN_HAND)
+    grip = GripPose(np.zeros(3), GRIP_IN_HAND.as_matrix())
+    goals = absolute_actions(trajectory.actions, grip, [grip] * steps)
     return Rendered(
         replay_mode=trajectory.mode,
         state=state,
         joint_state=trajectory.states[:-1, ARM].astype(np.float32),
         action=trajectory.actions.astype(np.float32),
-        action_absolute=absolute_actions(trajectory.actions, path).astype(np.float32),
+        action_absolute=goals.astype(np.float32),
         streams=streams_of_frames,
         geometry={geometry.stream_id: fixed for geometry in geometries},
         quality=trajectory.quality,

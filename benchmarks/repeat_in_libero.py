@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--limit", type=int, help="number of trajectories; all by default")
     arguments = parser.parse_args()
     is_run = (arguments.data / "plan.parquet").exists()
-    trajectories = _of_run(arguments.data) if is_run else _of_demonstrations(arguments.data)
+    trajectories = of_run(arguments.data) if is_run else _of_demonstrations(arguments.data)
     tried: Counter[str] = Counter()
     equal: Counter[str] = Counter()
     env, task = None, None
@@ -70,7 +70,7 @@ class Done(NamedTuple):
     actions: Floats
 
 
-def _of_run(folder: Path) -> Iterator[Done]:
+def of_run(folder: Path) -> Iterator[Done]:
     store = TrajectoryStore(folder / "trajectories")
     replayed = store.rows()
     rows = {row.trajectory_id: row for row in plan.read(folder / "plan.parquet")}

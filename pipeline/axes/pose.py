@@ -422,12 +422,12 @@ class PoseAxis(Axis):
         component, moved = pick(rng, self._choices(task))
         level = self.draw_level(rng)
         if component == "scene":
-            return self._sample_scene(rng, level, task)
+            return self._sample_moved_scene(rng, level, task)
         dx_m, dy_m = point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
         turn_deg = round(rng.uniform(-self.turn_deg, self.turn_deg), 2)
         return PosePerturbation(level=level, component=component, moved=moved, dx_m=dx_m, dy_m=dy_m, dyaw_deg=turn_deg)
 
-    def _sample_scene(self, rng: np.random.Generator, level: Level, task: Task) -> ScenePerturbation:
+    def _sample_moved_scene(self, rng: np.random.Generator, level: Level, task: Task) -> ScenePerturbation:
         """Sample a scene from LIBERO's own places, or in the goal suite from the benchmark's."""
         places_m = _benchmark_places_m(task)
         if not places_m or 5 not in self.levels or rng.random() >= self.benchmark_places:

@@ -76,5 +76,5 @@ def refuse_other_actions(
             f"the server announces {announced} actions, and the evaluation executes {actions} ones",
             where=server,
             expected="equal actions of server and evaluation",
-            remedy=f"evaluate with --actions {announced}; harness and lerobot-eval: the setting `actions: {announced}`",
+            remedy=f"evaluate with --actions {announced}; in the harness, with the setting `actions: {announced}`",
         )

@@ -51,7 +51,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             is always rendered.
         send_wrist_image, send_state, quat_no_antipodal: content of the observation, in the names of vla-eval's own
             LIBERO benchmark. vla-eval's model servers set these arguments.
-        absolute_action: argument of vla-eval's LIBERO benchmark; rejected here.
+        absolute_action: argument of vla-eval's LIBERO benchmark; true requires the setting `actions: absolute`.
         env_seed: argument of vla-eval's LIBERO benchmark: seed of LIBERO's reset.
         out, label: folder for the rows of the policy, in the format of ``evaluate``, and the policy's name there; by
             default no rows are written.

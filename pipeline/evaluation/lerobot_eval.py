@@ -62,6 +62,7 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
     seed: int = 0
     prompt: str = "clean"
     step_limits: str = "openvla"
+    actions: str = "delta"
     out: str | None = None
     label: str = ""
     assets: str | None = None
@@ -94,7 +95,7 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
                 expected="1",
                 remedy="set --eval.batch_size to run several episodes at the same time",
             )
-        given = {name: getattr(self, name) for name in ("prompt", "seed", "step_limits")}
+        given = {name: getattr(self, name) for name in ("prompt", "seed", "step_limits", "actions")}
         settings = EpisodeSettings.model_validate({**given, "runner": "lerobot-eval"})
         archive = None if self.assets is None else Path(self.assets)
         evaluation = self._evaluation(settings, archive)

@@ -18,7 +18,7 @@ from pipeline.libero.arenas import SURFACES
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
-from pipeline.scenes.compiled import fixed_pose, physics_to_read
+from pipeline.scenes.compiled import fixed_pose, grip_pose, physics_to_read
 from pipeline.types import Floats, Push, Scene, Task
 
 DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -264,9 +264,8 @@ class Environment:
     @property
     def hand(self) -> tuple[Floats, Rotation]:
         """Return position (3,) in m and orientation of the grip site, in the world's frame."""
-        data = self.sim.data._data
-        grip = data.site("gripper0_grip_site")
-        return grip.xpos.copy(), Rotation.from_matrix(grip.xmat.reshape(3, 3))
+        grip = grip_pose(self.sim.data._data)
+        return grip.position_m, Rotation.from_matrix(grip.rotation)
 
     def pose(self, name: str) -> Floats:
         """Return the pose (7,), position in m and rotation wxyz, of an object, a fixture or a region.

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
-from pipeline.scenes.compiled import ARM, FINGERS, CompiledScene
+from pipeline.scenes.compiled import ARM, FINGERS, CompiledScene, grip_pose
 from pipeline.types import Floats, Quality, State, Task, Trajectory
 
 MOVED_M = 0.001
@@ -26,16 +26,16 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
         ValueError: if MuJoCo rejects the scene.
     """
     scene = CompiledScene(trajectory.scene)
-    model, data = scene.model, scene.data
+    model = scene.model
     target_names = of_goal(bddl.read(task.bddl_file))
     allowed_roots = {int(model.body(f"{name}_main").rootid[0]) for name in target_names}
     robot = int(model.body("robot0_base").rootid[0])
     positions, rotations, touched_steps = [], [], 0
     for step, state in enumerate(trajectory.states):
         scene.restore(state)
-        grip = data.site("gripper0_grip_site")
-        positions.append(grip.xpos.copy())
-        rotations.append(grip.xmat.reshape(3, 3).copy())
+        grip = grip_pose(scene.data)
+        positions.append(grip.position_m)
+        rotations.append(grip.rotation)
         root_pairs = model.body_rootid[scene.contacts].tolist()
         touched_roots: set[int] = set()
         for pair in root_pairs:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipeline.libero.arenas import SURFACES
-from pipeline.scenes.compiled import CompiledScene, fixed_pose
+from pipeline.scenes.compiled import CompiledScene, fixed_pose, grip_pose
 from pipeline.types import Floats, Scene
 
 Mask = NDArray[np.bool_]
@@ -73,8 +73,7 @@ class Reference:
         partners = []
         for step, state in enumerate(states):
             compiled.restore(state)
-            grip = data.site("gripper0_grip_site")
-            positions[step], matrices[step] = grip.xpos, grip.xmat.reshape(3, 3)
+            positions[step], matrices[step] = grip_pose(data)
             for name in objects:
                 poses[name][step] = data.joint(f"{name}_joint0").qpos
             partners.append(_partners(compiled))

@@ -7,7 +7,6 @@ perturb, restore, render, add noise, turn.
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,12 +15,12 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA, named
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import encode, to_policy
-from pipeline.physics.controller_goals import absolute_actions, grip_path
+from pipeline.physics.controller_goals import absolute_actions, first_posture
 from pipeline.planning.streams import Stream
 from pipeline.rendering.geometry import Instances, see
 from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import FirstFrame
-from pipeline.scenes.compiled import proprioception
+from pipeline.scenes.compiled import grip_pose, proprioception
 from pipeline.types import Floats, Frame, Jpeg, Rendered, Task, Trajectory
 
 Started = Mapping[str, Callable[[], Frame]]
@@ -39,20 +38,17 @@ def render(
     renderer = opened.renderer(trajectory.model_xml)
     instances = Instances(renderer.model, trajectory, task) if named(render_config.extras) else None
     steps = range(len(trajectory.actions))
-    proprioceptions, poses = [], []
+    renderer.restore(first_posture(trajectory.scene, renderer.model), trajectory.site_alpha[0])
+    first_grip = grip_pose(renderer.data)
+    proprioceptions, grips, poses = [], [], []
     for step in steps:
         renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
         proprioceptions.append(proprioception(renderer.data))
+        grips.append(grip_pose(renderer.data))
         if instances:
             poses.append(instances.poses(renderer.data))
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
-
-    def restored(state: Floats) -> mujoco.MjData:
-        renderer.restore(state, trajectory.site_alpha[0])
-        return renderer.data
-
-    path = grip_path(trajectory.scene, trajectory.states[:-1], restored)
-    goals = absolute_actions(trajectory.actions, path)
+    goals = absolute_actions(trajectory.actions, first_grip, grips)
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
     encoded: dict[str, list[Jpeg]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}

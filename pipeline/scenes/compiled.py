@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ET
 from functools import lru_cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -115,6 +116,24 @@ def fixed_pose(data: mujoco.MjData, name: str) -> Floats:
     site, quaternion = data.site(name), np.empty(4)
     mujoco.mju_mat2Quat(quaternion, site.xmat)
     return np.concatenate([site.xpos, quaternion])
+
+
+class GripPose(NamedTuple):
+    """Pose of the grip site, which the controller moves, in the world.
+
+    Attributes:
+        position_m: (3,).
+        rotation: (3, 3).
+    """
+
+    position_m: Floats
+    rotation: Floats
+
+
+def grip_pose(data: mujoco.MjData) -> GripPose:
+    """Return the grip site's pose in a restored scene."""
+    site = data.site("gripper0_grip_site")
+    return GripPose(site.xpos.copy(), site.xmat.reshape(3, 3).copy())
 
 
 def proprioception(data: mujoco.MjData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

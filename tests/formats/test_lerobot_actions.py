@@ -27,11 +27,12 @@ def test_policies_train_on_the_chosen_actions(choice: str, trained: str, other: 
     target = LeRobot(tmp_path, options)
     export(target, episodes(), loop)
     written = [episode(episode_id) for episode_id in IDS]
-    expected = np.concatenate([getattr(one, trained) for one in written])
-    beside = np.concatenate([one.action_absolute if choice == "delta" else one.action for one in written])
+    expected = np.concatenate([getattr(source, trained) for source in written])
+    untrained = "action_absolute" if choice == "delta" else "action"
+    expected_of_other = np.concatenate([getattr(source, untrained) for source in written])
     dataset = LeRobotDataset(NAME, root=target.root, video_backend="pyav")
     np.testing.assert_array_equal(np.stack(dataset.hf_dataset.with_format("numpy")["action"]), expected)
-    np.testing.assert_array_equal(np.stack(dataset.hf_dataset.with_format("numpy")[other]), beside)
+    np.testing.assert_array_equal(np.stack(dataset.hf_dataset.with_format("numpy")[other]), expected_of_other)
     features = dataset_to_policy_features(dataset.meta.features)
     assert [name for name, feature in features.items() if feature.type is FeatureType.ACTION] == ["action"]
     assert dataset.meta.features["action"]["names"] == list(getattr(SCHEMA, trained).names)
@@ -39,11 +40,12 @@ def test_policies_train_on_the_chosen_actions(choice: str, trained: str, other: 
     modality = json.loads((target.root / "meta" / "modality.json").read_text())
     assert {entry["original_key"] for entry in modality["action"].values()} == {"action"}
     rows = {
-        one.episode_id: {"episode_id": one.episode_id, "demo_id": "task/demo", "steps": len(one)} for one in written
+        source.episode_id: {"episode_id": source.episode_id, "demo_id": "task/demo", "steps": len(source)}
+        for source in written
     }
     assert [fault.what for _, fault in target.check(rows, tmp_path / "cache")] == []
-    for one in written:
-        copy = target.read(rows[one.episode_id], tmp_path / "cache")
+    for source in written:
+        copy = target.read(rows[source.episode_id], tmp_path / "cache")
         assert copy is not None
-        np.testing.assert_array_equal(copy.episode.action, one.action)
-        np.testing.assert_array_equal(copy.episode.action_absolute, one.action_absolute)
+        np.testing.assert_array_equal(copy.episode.action, source.action)
+        np.testing.assert_array_equal(copy.episode.action_absolute, source.action_absolute)

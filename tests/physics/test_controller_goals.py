@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import PhysicsPerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
-from pipeline.physics.controller_goals import GripPath, absolute_actions
+from pipeline.physics.controller_goals import absolute_actions, replayed_grips
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
 from pipeline.seeding import rng
@@ -40,7 +40,7 @@ def test_goals_are_those_of_robosuites_controller(component: str) -> None:
         environment.step(action)
         positions_m.append(controller.goal_pos.copy())
         rotations.append(controller.goal_ori.copy())
-    goals = absolute_actions(actions, GripPath.of(trajectory.scene, np.stack(states)))
+    goals = absolute_actions(actions, *replayed_grips(trajectory.scene, states))
     np.testing.assert_allclose(goals[:, :3], positions_m, atol=1e-9)
     turned_rad = (Rotation.from_rotvec(goals[:, 3:6]).inv() * Rotation.from_matrix(rotations)).magnitude()
     assert turned_rad.max() < 1e-6
