@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
@@ -16,6 +16,7 @@ from pipeline.axes.language import load_bank
 from pipeline.catalogue import object_sources, texture_sources
 from pipeline.compute_config import ComputeConfig
 from pipeline.config_faults import describe
+from pipeline.episode_schema import SCHEMA, SIZE_PX, Content
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, ExportConfig
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
@@ -203,19 +204,45 @@ class FilterConfig(Frozen):
         return None
 
 
+FurtherCamera = Literal["frontview", "birdview", "sideview", "galleryview"]
+"""Camera of ``further_views`` in ``schemas/episode.json``."""
+
+Name = TypeVar("Name", bound=str)
+
+
+def _sorted_once(names: tuple[Name, ...]) -> tuple[Name, ...]:
+    return tuple(sorted(set(names)))
+
+
 class RenderConfig(Frozen):
-    """Options of rendering. ``schemas/episode.json`` states the size of the frames.
+    """Options of rendering.
 
     Attributes:
+        size_px: Height and width of the frames in pixels, an even number from 64 to 512; 256 by default, as in
+            LIBERO-Plus's training set.
+        views: LIBERO's cameras to show in addition to the agent view and the wrist view: ``frontview``, ``birdview``,
+            ``sideview`` and ``galleryview``; none by default. The axes camera and noise leave them unchanged.
         encoding: File format of the frames; only ``jpeg`` exists.
         jpeg_quality: JPEG quality of the frames, 50 to 100; 95 by default.
-        extras: Further content of all datasets: ``depth`` and ``segmentation`` of both views, and ``object_poses``;
+        extras: Further content of all datasets: ``depth`` and ``segmentation`` of all views, and ``object_poses``;
             none by default.
     """
 
+    # The defaults are left out, so that earlier frames and datasets stay up to date.
+    size_px: int = Field(default=SIZE_PX, ge=64, le=512, multiple_of=2, exclude_if=lambda size_px: size_px == SIZE_PX)
+    views: Annotated[tuple[FurtherCamera, ...], AfterValidator(_sorted_once)] = Field(
+        default=(), exclude_if=lambda views: not views
+    )
+
     encoding: Literal["jpeg"] = "jpeg"
     jpeg_quality: int = Field(default=95, ge=50, le=100)
-    extras: Annotated[tuple[RenderedExtra, ...], AfterValidator(lambda extras: tuple(sorted(set(extras))))] = ()
+    extras: Annotated[tuple[RenderedExtra, ...], AfterValidator(_sorted_once)] = ()
+
+    @property
+    def content(self) -> Content:
+        """Return the content of the episodes."""
+        further_views = [view for view, spec in SCHEMA.further_views.items() if spec.camera in self.views]
+        return Content((*SCHEMA.views, *further_views), self.size_px, self.extras)
 
 
 class Config(Frozen):

@@ -1,7 +1,8 @@
 """``schemas/episode.json`` as a typed object, and the check of an episode against it."""
 
 import io
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, Self
 
@@ -118,6 +119,9 @@ class EpisodeSchema(Frozen):
     """Names, shapes, units and signs that all writers read.
 
     Attributes:
+        views: name of each view of every episode to its camera.
+        further_views: the same of the views that a run has on request.
+        frame: storage of frames of the default size.
         provenance: name of each provenance column, as in the manifest, to its type.
     """
 
@@ -126,6 +130,7 @@ class EpisodeSchema(Frozen):
     image_rotation_deg: int
     min_steps: int
     views: dict[str, ViewSpec]
+    further_views: dict[str, ViewSpec]
     frame: FrameSpec
     intrinsics: MatrixSpec
     extrinsics: MatrixSpec
@@ -141,6 +146,12 @@ class EpisodeSchema(Frozen):
 
 SCHEMA = EpisodeSchema.model_validate_json(schema_file("episode.json").read_text())
 
+ALL_VIEWS = SCHEMA.views | SCHEMA.further_views
+"""Name of each view that an episode may have, to its camera."""
+
+SIZE_PX = SCHEMA.frame.shape[0]
+"""Default height and width of frames."""
+
 MOTION = ("action", "action_absolute", "state", "joint_state")
 """Numeric arrays of an episode, with a row for each step."""
 
@@ -154,22 +165,69 @@ OUTCOME: Mapping[str, Literal["bool", "string"]] = {"success": "bool", "reason":
 """Columns of failures in addition to provenance, to their types: ``success`` is false, ``reason`` is the manifest's."""
 
 
-def provenance_of(extras: Collection[Extra]) -> dict[str, str]:
-    """Return the names of the provenance columns of episodes with these extras, to their types."""
-    outcome = OUTCOME if "outcome" in extras else {}
-    return {**SCHEMA.provenance, **outcome}
+@dataclass(frozen=True)
+class Content:
+    """Content that all episodes of a run have in common.
+
+    Attributes:
+        views: names of the views, those of every episode first.
+        size_px: height and width of the frames.
+        extras: content in addition to the frames.
+    """
+
+    views: tuple[str, ...] = tuple(SCHEMA.views)
+    size_px: int = SIZE_PX
+    extras: tuple[Extra, ...] = ()
+
+    @property
+    def cameras(self) -> dict[str, ViewSpec]:
+        """Map the name of each view to its camera."""
+        return {view: ALL_VIEWS[view] for view in self.views}
+
+    @property
+    def frame_shape(self) -> tuple[int, int, int]:
+        return self.size_px, self.size_px, SCHEMA.frame.shape[2]
+
+    @property
+    def area(self) -> float:
+        """Return the number of pixels of a frame, as a multiple of the default."""
+        return (self.size_px / SIZE_PX) ** 2
+
+    @property
+    def maps(self) -> tuple[Extra, ...]:
+        """List the requested maps of each view."""
+        return tuple(name for name in MAPS if name in self.extras)
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """Map the names of the provenance columns to their types."""
+        outcome = OUTCOME if "outcome" in self.extras else {}
+        return {**SCHEMA.provenance, **outcome}
+
+    @property
+    def has_names(self) -> bool:
+        """Return whether the episodes have a table of names."""
+        return bool({"segmentation", "object_poses"} & set(self.extras))
+
+    def including(self, extra: Extra) -> "Content":
+        """Return the content with one more extra."""
+        return replace(self, extras=(*self.extras, extra))
+
+    def stated(self) -> list[object]:
+        """Return the parts of a dataset's identity; parts with default values are left out, as in earlier versions."""
+        is_standard = (self.views, self.size_px) == (Content.views, Content.size_px)
+        return [self.extras] if is_standard else [self.extras, self.views, self.size_px]
 
 
-def named(extras: Collection[Extra]) -> bool:
-    """Return whether episodes with these extras have a table of names."""
-    return bool({"segmentation", "object_poses"} & set(extras))
+STANDARD = Content()
+"""Content of a run with default options."""
 
 
-def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
+def check(episode: Episode, content: Content = STANDARD) -> None:
     """Reject an episode that training code would misread or fail on.
 
     Args:
-        extras: the extras that the episode must have in addition to the frames.
+        content: the content that the episode must have.
 
     Raises:
         PipelineError: naming the episode and the field.
@@ -184,12 +242,12 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     if episode.action.min() < low or episode.action.max() > high:
         span = f"spans [{episode.action.min():g}, {episode.action.max():g}]"
         raise _fault(episode, "action", span, f"[{low:g}, {high:g}], as the controller clips it")
-    _check_frames(episode, steps)
-    _check_geometry(episode, steps, extras)
+    _check_frames(episode, steps, content)
+    _check_geometry(episode, steps, content)
     if not episode.instruction.strip() or "_" in episode.instruction:
         # OpenVLA-OFT's loader never returns on an empty text; an underscore indicates a file name.
         raise _fault(episode, "instruction", f"is {episode.instruction!r}", "words without underscores")
-    columns = provenance_of(extras)
+    columns = content.provenance
     if set(episode.provenance) != set(columns):
         wrong = sorted(set(episode.provenance) ^ set(columns))
         raise _fault(episode, "provenance", f"lacks or adds {wrong}", f"exactly {list(columns)}")
@@ -202,11 +260,10 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
         raise _fault(episode, "provenance", f"names episode {episode.provenance['episode_id']!r}", "its own episode_id")
 
 
-def _check_frames(episode: Episode, steps: int) -> None:
-    if set(episode.frames) != set(SCHEMA.views):
-        raise _fault(episode, "frames", f"has the views {sorted(episode.frames)}", f"{sorted(SCHEMA.views)}")
-    height, width, _ = SCHEMA.frame.shape
-    expected = (SCHEMA.frame.encoding.upper(), "RGB", (width, height))
+def _check_frames(episode: Episode, steps: int, content: Content) -> None:
+    if set(episode.frames) != set(content.views):
+        raise _fault(episode, "frames", f"has the views {sorted(episode.frames)}", f"{sorted(content.views)}")
+    expected = (SCHEMA.frame.encoding.upper(), "RGB", (content.size_px, content.size_px))
     for view, frames in episode.frames.items():
         if len(frames) != steps:
             raise _fault(episode, view, f"has {len(frames)} frames", f"{steps}, one per action")
@@ -232,22 +289,22 @@ def _look(header: bytes) -> tuple[str | None, str, tuple[int, int]]:
         return image.format, image.mode, image.size
 
 
-def _check_geometry(episode: Episode, steps: int, extras: Collection[Extra]) -> None:
-    if set(episode.geometry) != set(SCHEMA.views):
-        raise _fault(episode, "geometry", f"has the views {sorted(episode.geometry)}", f"{sorted(SCHEMA.views)}")
+def _check_geometry(episode: Episode, steps: int, content: Content) -> None:
+    if set(episode.geometry) != set(content.views):
+        raise _fault(episode, "geometry", f"has the views {sorted(episode.geometry)}", f"{sorted(content.views)}")
     for view, geometry in episode.geometry.items():
         for name in MATRICES:
             _check_array(episode, f"{view}_{name}", getattr(geometry, name), getattr(SCHEMA, name))
         lengths = {name: len(files) for name, files in geometry.maps.items()}
-        wanted = {name: steps for name in MAPS if name in extras}
+        wanted = dict.fromkeys(content.maps, steps)
         if lengths != wanted:
             raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each requested map")
-    if ("object_poses" in extras) != (episode.object_poses is not None):
+    if ("object_poses" in content.extras) != (episode.object_poses is not None):
         expected = "poses if, and only if, render.extras lists them"
         raise _fault(episode, "object_poses", "are missing or not requested", expected)
     if episode.object_poses is not None:
         _check_array(episode, "object_poses", episode.object_poses, SCHEMA.object_poses, steps)
-    if named(extras) != bool(episode.instances):
+    if content.has_names != bool(episode.instances):
         expected = "names if, and only if, render.extras lists segmentation or object_poses"
         raise _fault(episode, "instances", f"has {len(episode.instances)} names", expected)
 

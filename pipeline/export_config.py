@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, create_model, model_validator
 
 from pipeline.axes.component_names import ComponentName
+from pipeline.episode_schema import STANDARD, Content
 from pipeline.formats.base import Format, FormatOptions, Options
 from pipeline.formats.episodes import too_few, validating
 from pipeline.formats.registry import FORMATS
-from pipeline.types import Extra, Frozen
+from pipeline.types import Frozen
 
 FAILURES = "failures"
 """Folder of a run with the datasets of replays that missed their goal."""
@@ -100,16 +101,16 @@ class ExportConfig(_Formats):
         options: Options | None = getattr(self, kind.name)
         return options
 
-    def datasets(self, folder: Path, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
-        """List the requested datasets of a run in ``folder`` whose episodes have these extras."""
+    def datasets(self, folder: Path, content: Content = STANDARD) -> list[Format[Any]]:
+        """List the requested datasets of a run in ``folder`` whose episodes have this content."""
         formats = self.formats
-        return [kind(folder, formats[kind.name], extras) for kind in FORMATS if kind.name in formats]
+        return [kind(folder, formats[kind.name], content) for kind in FORMATS if kind.name in formats]
 
-    def failure_datasets(self, folder: Path, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
+    def failure_datasets(self, folder: Path, content: Content = STANDARD) -> list[Format[Any]]:
         """List the datasets of failures of a run in ``folder``; the list is empty if failures are not requested."""
         if not self.failures:
             return []
-        return self.of_failures().datasets(folder / FAILURES, (*extras, "outcome"))
+        return self.of_failures().datasets(folder / FAILURES, content.including("outcome"))
 
     @property
     def name(self) -> str:

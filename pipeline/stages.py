@@ -176,7 +176,7 @@ def render(run: Run) -> None:
         rejected: dict[str, str] | None = None
         # `render_plan` renders the reserves that are already replayed. This loop replays the other reserves.
         while True:
-            rejected_now = rejections(rows, frames_by_trajectory(run.frames.rows()))
+            rejected_now = rejections(rows, frames_by_trajectory(run.frames.rows()), config.render.content.views)
             if rejected_now == rejected:
                 break
             rejected = rejected_now

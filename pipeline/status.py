@@ -10,6 +10,7 @@ from rich.table import Table
 
 from pipeline import stages
 from pipeline.config import Config
+from pipeline.episode_schema import STANDARD
 from pipeline.errors import PipelineError
 from pipeline.generated import FOLDERS, edits, edits_in_words
 from pipeline.planning import plan, selection
@@ -34,7 +35,8 @@ def told(run: Run) -> Iterator[str | Table]:
         return
     verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
     frames = frames_by_trajectory(run.frames.rows())
-    rejected = outcome.rejections(rows, frames)
+    views = config.render.content.views
+    rejected = outcome.rejections(rows, frames, views)
     judged = selection.select(rows, verdicts, rejected)
     yield _counts(config, rows, judged, frames)
     steps = dict(_steps(run, rows, verdicts, frames, rejected))
@@ -72,12 +74,13 @@ def _counts(
     table = Table("axis", title="episodes")
     for head in ("wanted", "planned", "reach their goal", "rendered"):
         table.add_column(head, justify="right", no_wrap=True)
-    every = []
+    views, every = config.render.content.views, []
     for axis in ("clean", *config.plan.episodes):
         of_axis = [row for row in rows if row.axis == axis]
         kept = [row for row in of_axis if judged[row.episode_id].kept]
         planned = sum(row.wanted for row in of_axis)
-        wanted, rendered = config.plan.episodes.get(axis, planned), sum(outcome.rendered(row, frames) for row in kept)
+        wanted = config.plan.episodes.get(axis, planned)
+        rendered = sum(outcome.rendered(row, frames, views) for row in kept)
         every.append((wanted, planned, len(kept), rendered))
         # The name of a combination may break after a +.
         table.add_row(axis.replace("+", "+ "), *map(str, every[-1]))
@@ -107,7 +110,7 @@ def _steps(
     judged = selection.select(rows, verdicts, rejected)
     to_render = [row for row in rows if judged[row.episode_id].kept]
     to_render += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
-    missing = [row for row in to_render if not outcome.rendered(row, frames)]
+    missing = [row for row in to_render if not outcome.rendered(row, frames, config.render.content.views)]
     if missing:
         yield "render", f"the frames of {len(missing)} episodes are missing" + _of(generated_again, "files of frames")
     if needed or missing or why_planned is not None:
@@ -172,7 +175,7 @@ def _time_left(
         return
     exports = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
     validates = exports or any(step.startswith(("manifest", "validate")) for step in steps)
-    left = not_made(needed, verdicts, frames) | {
+    left = not_made(needed, verdicts, frames, run.config.render.content.views) | {
         "export": float(exports),
         "validate": float(validates),
     }
@@ -182,7 +185,10 @@ def _time_left(
 
 
 def not_made(
-    needed: Sequence[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
+    needed: Sequence[plan.Row],
+    verdicts: Mapping[str, Verdict],
+    frames: Mapping[str, StoredFrames],
+    views: tuple[str, ...] = STANDARD.views,
 ) -> dict[str, float]:
     """Return the shares in [0, 1] of the trajectories and streams that ``replay`` and ``render`` have yet to generate.
 
@@ -191,7 +197,7 @@ def not_made(
     trajectories = {row.trajectory_id for row in needed}
     streams = set()
     for row in needed:
-        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations).values()}
+        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations, views).values()}
     rendered = set()
     for trajectory, shown in frames.items():
         rendered |= {(trajectory, stream) for stream in shown.streams}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipeline import seeding
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, Content
 from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
@@ -134,7 +134,7 @@ def write_format(kind: type[Format[Any]], out: Path) -> Format[Any]:
 def write_rlds(
     out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, extras: Sequence[Extra] = ()
 ) -> Rlds:
-    target = Rlds(out, RldsConfig(name=NAME, shards=3), extras)
+    target = Rlds(out, RldsConfig(name=NAME, shards=3), Content(extras=tuple(extras)))
     export(target, episodes(load), run)
     return target
 
@@ -148,7 +148,7 @@ def write_lerobot(
     extras: Sequence[Extra] = (),
     shards: int = 3,
 ) -> LeRobot:
-    target = LeRobot(out, LeRobotConfig(name=name, shards=shards, frames=frames), extras)
+    target = LeRobot(out, LeRobotConfig(name=name, shards=shards, frames=frames), Content(extras=tuple(extras)))
     export(target, episodes(load), run)
     return target
 
@@ -160,7 +160,7 @@ def write_lerobot_v21(
     run: Any = loop,
     extras: Sequence[Extra] = (),
 ) -> LeRobotV21:
-    target = LeRobotV21(out, LeRobotV21Config(name=NAME, convention=convention), extras)
+    target = LeRobotV21(out, LeRobotV21Config(name=NAME, convention=convention), Content(extras=tuple(extras)))
     export(target, episodes(load), run)
     return target
 

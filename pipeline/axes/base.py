@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Measures, ObservedEpisode, Plot, Strips
+from pipeline.episode_schema import ALL_VIEWS
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
@@ -91,7 +92,7 @@ class Perturbation(Frozen):
     level: Level
 
     layer: ClassVar[Layer]
-    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
+    views: ClassVar[frozenset[str]] = frozenset(ALL_VIEWS)
     measure: ClassVar[str] = "undefined, because the benchmark has no such test"
     unit: ClassVar[str | None] = None
     clearance: ClassVar[float] = 0.0

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, NamedTuple,
 import pyarrow as pa
 from pydantic import AfterValidator, Field
 
-from pipeline.episode_schema import SCHEMA, GripperSpec
+from pipeline.episode_schema import SCHEMA, STANDARD, Content, GripperSpec
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
 from pipeline.identity import made_with_recipe
 from pipeline.record import Basis, Record
-from pipeline.types import LONGEST_NAME, Extra, Frozen
+from pipeline.types import LONGEST_NAME, Frozen
 
 Row = Mapping[str, Any]
 """A row of the manifest."""
@@ -117,7 +117,7 @@ class Format(ABC, Generic[Options]):
     """A format's dataset of one run.
 
     Args:
-        extras: content of the episodes in addition to the frames.
+        content: content of the episodes.
     """
 
     name: ClassVar[str]
@@ -151,10 +151,10 @@ class Format(ABC, Generic[Options]):
     gripper: GripperSpec = SCHEMA.action.gripper
     """The commands of the gripper in this format."""
 
-    def __init__(self, data: Path, options: Options, extras: Sequence[Extra] = ()) -> None:
+    def __init__(self, data: Path, options: Options, content: Content = STANDARD) -> None:
         self.data = data
         self.options = options
-        self.extras = tuple(extras)
+        self.content = content
 
     @classmethod
     def made_with(cls) -> dict[str, str]:

@@ -92,12 +92,11 @@ def count(frame: Frame) -> Counts:
     return np.stack(channels).astype(np.int64)
 
 
-def of_levels(counts: Counts) -> dict[str, NDArray[Any]]:
-    """Compute lerobot's statistics of a camera, each (3, 1, 1) in [0, 1], the range of its frames.
+def of_levels(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
+    """Compute lerobot's statistics of a camera, each (3, 1, 1) in [0, 1], from the levels of a number of frames.
 
     ``count`` is (1,), in frames. A quantile is the least level at which the cumulative share of pixels reaches it.
     """
-    height, width, _ = SCHEMA.frame.shape
     pixels = counts.sum(axis=1)
     mean = counts @ _LEVELS / pixels
     shares = counts.cumsum(axis=1) / pixels[:, None]
@@ -109,4 +108,4 @@ def of_levels(counts: Counts) -> dict[str, NDArray[Any]]:
         **{name: (shares >= q).argmax(axis=1) for name, q in QUANTILES.items()},
     }
     scaled = {name: levels.reshape(3, 1, 1) / 255 for name, levels in figures.items()}
-    return {**scaled, "count": pixels[:1] // (height * width)}
+    return {**scaled, "count": np.array([frames])}

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import pyarrow as pa
 
-from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA
+from pipeline.episode_schema import MAPS, MATRICES, MOTION, STANDARD, Content
 from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
@@ -59,15 +59,15 @@ class Rlds(Format[RldsConfig]):
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
         column("rlds_index", pa.int64(), "place in the shard, null when dropped"),
     )
-    keys = (
-        {name: name for name in (*SCHEMA.views, *MOTION)}
-        | {f"{view}_{name}": f"{view}_{name}" for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
-        | {"provenance": "episode_metadata"}
-    )
     clients = ("openvla_oft",)
 
+    def __init__(self, data: Path, options: RldsConfig, content: Content = STANDARD) -> None:
+        super().__init__(data, options, content)
+        of_cameras = [f"{view}_{name}" for view in content.views for name in (*MATRICES, *MAPS)]
+        self.keys = {name: name for name in (*content.views, *MOTION, *of_cameras)} | {"provenance": "episode_metadata"}
+
     def step_kb(self, sizes: StepSizes) -> float:
-        return len(SCHEMA.views) * (sizes.frame_kb + sizes.maps_kb) + sizes.poses_kb + sizes.motion_kb
+        return len(self.content.views) * (sizes.frame_kb + sizes.maps_kb) + sizes.poses_kb + sizes.motion_kb
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
@@ -84,13 +84,14 @@ class Rlds(Format[RldsConfig]):
 
     def _shard_steps(self) -> int:
         """Return the number of steps in a shard of ``SHARD_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
-        map_kb = sum({"depth": 31.0, "segmentation": 3.0}.get(extra, 0.0) for extra in self.extras)
-        return int(1000 * SHARD_MB / (len(SCHEMA.views) * (20.0 + map_kb) + 1.0))
+        map_kb = sum({"depth": 31.0, "segmentation": 3.0}.get(extra, 0.0) for extra in self.content.extras)
+        view_kb = (20.0 + map_kb) * self.content.area
+        return int(1000 * SHARD_MB / (len(self.content.views) * view_kb + 1.0))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats import rlds_write
 
-        rlds_write.write_shard(path, piece.ids, load, self.extras)
+        rlds_write.write_shard(path, piece.ids, load, self.content)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
         from pipeline.formats import rlds_write
@@ -98,7 +99,7 @@ class Rlds(Format[RldsConfig]):
         shards = {work / piece.path: piece.ids for piece in pieces}
         for folder in dict.fromkeys(path.parent for path in shards):
             lengths = {path: len(ids) for path, ids in shards.items() if path.parent == folder}
-            rlds_write.write_metadata(folder, lengths, self.extras)
+            rlds_write.write_metadata(folder, lengths, self.content)
         places = {}
         for path, ids in shards.items():
             for index, episode_id in enumerate(ids):
@@ -113,12 +114,12 @@ class Rlds(Format[RldsConfig]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import rlds_read
 
-        return rlds_read.check(self.folder, kept, self.extras, self.options.validation)
+        return rlds_read.check(self.folder, kept, self.content, self.options.validation)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import rlds_read
 
-        return rlds_read.read(self.folder, row, self.extras)
+        return rlds_read.read(self.folder, row, self.content)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         builders = ""

@@ -9,7 +9,7 @@ from typing import Any
 import tensorflow_datasets as tfds
 from google.protobuf import json_format
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named, provenance_of
+from pipeline.episode_schema import MATRICES, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
@@ -18,7 +18,7 @@ from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.rlds_write import texts as rlds_texts
 from pipeline.formats.tfrecord import METADATA, OVERHEAD_BYTES, columns, record_at, records, spans
-from pipeline.types import Episode, Extra, Geometry
+from pipeline.types import Episode, Geometry
 
 MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")
 """Columns that distinguish steps."""
@@ -38,7 +38,7 @@ def open_all(root: Path) -> None:
 
 
 def check(
-    root: Path, kept: Mapping[str, Row], extras: tuple[Extra, ...], validation: float = 0.0
+    root: Path, kept: Mapping[str, Row], content: Content, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
@@ -51,7 +51,7 @@ def check(
     for name in sorted(present | {dataset_of(row) for row in kept.values()}):
         folder = root / name / VERSION
         info = _info(folder)
-        if info.features.to_json() != features(extras).to_json():
+        if info.features.to_json() != features(content).to_json():
             yield "format", Fault("rlds", None, f"features.json of {name} differs", "that of this version")
         counts: dict[str, int] = {}
         for shard in sorted(folder.glob("*.tfrecord-*")):
@@ -63,7 +63,7 @@ def check(
             if shard_name in counts and counts[shard_name] != length:
                 expected = f"{length}, as dataset_info.json states"
                 yield "readable", Fault("rlds", None, f"{shard_name} has {counts[shard_name]} records", expected)
-        yield from (("format", fault) for fault in _wrong_info(folder, info, counts, extras))
+        yield from (("format", fault) for fault in _wrong_info(folder, info, counts, content))
         stored += sum(counts.values())
     # Reading the episodes reports missing ones.
     if stored > len(kept):
@@ -88,14 +88,14 @@ def _lengths(info: Any) -> dict[str, int]:
     return lengths
 
 
-def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tuple[Extra, ...]) -> Iterator[Fault]:
+def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], content: Content) -> Iterator[Fault]:
     """Compare ``dataset_info.json`` of a set with its shards.
 
     Args:
         folder: version folder of the set.
         info: TFDS's information about the set.
         counts: name of each complete shard to the number of its records.
-        extras: extras of the episodes.
+        content: content of the episodes.
     """
     name = folder.parent.name
     bytes_of: dict[str, int] = {}
@@ -118,7 +118,7 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tupl
         "citation": stated.get("citation"),
         "license": stated.get("redistributionInfo", {}).get("license"),
     }
-    texts = {key: text.strip() for key, text in rlds_texts(extras).items()}
+    texts = {key: text.strip() for key, text in rlds_texts(content).items()}
     wanted: dict[str, Any] = {
         "name": name,
         "version": VERSION,
@@ -134,7 +134,7 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tupl
     yield from unlike("rlds", read, wanted, f"{name}: ")
 
 
-def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
+def read(root: Path, row: Row, content: Content) -> Copy | None:
     """Read a kept episode from its place in the manifest or, if that is wrong, from any other place.
 
     Raises:
@@ -149,7 +149,7 @@ def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
             shards = sorted(root.glob("*/*/*.tfrecord-*"))
             place = _places(tuple(map(edition, shards))).get(episode_id)
             steps = _columns(place)
-        return None if place is None or steps is None else _copy(steps, place, extras)
+        return None if place is None or steps is None else _copy(steps, place, content)
     except KeyError as error:
         raise PipelineError(f"has no feature {error}", where=f"episode {episode_id}") from error
 
@@ -196,9 +196,9 @@ def _opened(info_file: Edition) -> Any:
     return info
 
 
-def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
+def _geometry(steps: Mapping[str, Any], view: str, content: Content) -> Geometry:
     matrices = {name: steps[f"{METADATA}{view}_{name}"] for name in MATRICES}
-    maps = {name: steps[f"observation/{view}_{name}"].tolist() for name in MAPS if name in extras}
+    maps = {name: steps[f"observation/{view}_{name}"].tolist() for name in content.maps}
     return Geometry(**matrices, maps=maps)
 
 
@@ -206,10 +206,10 @@ def _said(value: Any) -> str | int | float:
     return value.decode() if isinstance(value, bytes) else value.item()
 
 
-def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> Copy:
+def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
     shard, index = place
     instructions = [text.decode() for text in steps["language_instruction"]]
-    frames = {view: steps[f"observation/{view}"].tolist() for view in SCHEMA.views}
+    frames = {view: steps[f"observation/{view}"].tolist() for view in content.views}
     episode = Episode(
         episode_id=_id(steps),
         frames=frames,
@@ -218,10 +218,10 @@ def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> 
         action=steps["action"],
         action_absolute=steps["action_absolute"],
         instruction=instructions[0],
-        provenance={name: _said(steps[METADATA + name][0]) for name in provenance_of(extras)},
-        geometry={view: _geometry(steps, view, extras) for view in SCHEMA.views},
-        object_poses=steps["observation/object_poses"] if "object_poses" in extras else None,
-        instances=json.loads(steps[f"{METADATA}instances"][0]) if named(extras) else (),
+        provenance={name: _said(steps[METADATA + name][0]) for name in content.provenance},
+        geometry={view: _geometry(steps, view, content) for view in content.views},
+        object_poses=steps["observation/object_poses"] if "object_poses" in content.extras else None,
+        instances=json.loads(steps[f"{METADATA}instances"][0]) if content.has_names else (),
     )
     return Copy(
         dataset="rlds",

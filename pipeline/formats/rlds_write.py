@@ -15,16 +15,16 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MapSpec, MatrixSpec, VectorSpec, check, named, provenance_of
+from pipeline.episode_schema import MATRICES, SCHEMA, STANDARD, Content, MapSpec, MatrixSpec, VectorSpec, check
 from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
 from pipeline.formats.tfrecord import OVERHEAD_BYTES, framed
-from pipeline.types import Episode, Extra
+from pipeline.types import Episode
 
 
-def write_shard(path: Path, episode_ids: Sequence[str], load: Load, extras: tuple[Extra, ...] = ()) -> None:
-    """Write a TFRecord file of episodes that have these extras.
+def write_shard(path: Path, episode_ids: Sequence[str], load: Load, content: Content = STANDARD) -> None:
+    """Write a TFRecord file of episodes with this content.
 
     Raises:
         PipelineError: when an episode breaks the schema.
@@ -32,20 +32,20 @@ def write_shard(path: Path, episode_ids: Sequence[str], load: Load, extras: tupl
     with path.open("wb") as file:
         for episode_id in episode_ids:
             episode = load(episode_id)
-            check(episode, extras)
-            encoded = features(extras).encode_example(_nested_example(episode))
-            example = _serializer(extras).get_tf_example(encoded)
+            check(episode, content)
+            encoded = features(content).encode_example(_nested_example(episode))
+            example = _serializer(content).get_tf_example(encoded)
             # protobuf otherwise orders its map differently in every process.
             file.write(framed(example.SerializeToString(deterministic=True)))
 
 
-def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extra, ...] = ()) -> None:
+def write_metadata(folder: Path, lengths: Mapping[Path, int], content: Content = STANDARD) -> None:
     """Write the files that TFDS reads in addition to the shards.
 
     Args:
         folder: ``<name>/1.0.0``.
         lengths: each shard of the folder, in order, to its number of episodes.
-        extras: extras of the episodes.
+        content: content of the episodes.
     """
     infos = []
     for split_name in sorted({split_of(shard) for shard in lengths}):
@@ -61,18 +61,18 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
         )
     tfds.folder_dataset.write_metadata(
         data_dir=folder,
-        features=features(extras),
+        features=features(content),
         split_infos=infos,
         version=VERSION,
         filename_template=template,
         check_data=False,  # The check needs TensorFlow.
-        **texts(extras),
+        **texts(content),
     )
 
 
-def texts(extras: tuple[Extra, ...] = ()) -> dict[str, str]:
+def texts(content: Content = STANDARD) -> dict[str, str]:
     """Return the texts of ``dataset_info.json`` for people."""
-    kept, end = ("miss the goal", "failure") if "outcome" in extras else ("solve the task", "success")
+    kept, end = ("miss the goal", "failure") if "outcome" in content.extras else ("solve the task", "success")
     return {
         "description": f"LIBERO demonstrations, perturbed, replayed in simulation and kept when they {kept}. "
         f"Robot: Franka Panda. Every episode ends in {end}; episode_metadata says what was changed.",
@@ -84,24 +84,23 @@ def texts(extras: tuple[Extra, ...] = ()) -> dict[str, str]:
 
 
 @cache
-def features(extras: tuple[Extra, ...] = ()) -> Any:
+def features(content: Content = STANDARD) -> Any:
     """Return the feature tree (``tfds.features.FeaturesDict``)."""
     frame = partial(
         tfds.features.Image,
-        shape=SCHEMA.frame.shape,
+        shape=content.frame_shape,
         dtype=np.dtype(SCHEMA.frame.dtype),
         encoding_format=SCHEMA.frame.encoding,
     )
     rotated = f"RGB, before the action, rotated by {SCHEMA.image_rotation_deg} degrees from how MuJoCo renders it"
-    observation = {view: frame(doc=f"camera {spec.camera}: {rotated}") for view, spec in SCHEMA.views.items()}
+    observation = {view: frame(doc=f"camera {spec.camera}: {rotated}") for view, spec in content.cameras.items()}
     observation |= {"state": _tensor(SCHEMA.state), "joint_state": _tensor(SCHEMA.joint_state)}
-    for name in MAPS:
-        if name in extras:
-            observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
-    if "object_poses" in extras:
+    for name in content.maps:
+        observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name), content) for view in content.views}
+    if "object_poses" in content.extras:
         observation["object_poses"] = _tensor(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
-    failures = "outcome" in extras
+    failures = "outcome" in content.extras
     step = {
         "observation": observation,
         "action": _tensor(SCHEMA.action),
@@ -119,11 +118,11 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     metadata = {"file_path": tfds.features.Text(doc="where the demonstration was published, as demo_source")}
     meanings = {column["name"]: column["meaning"] for column in read_json(schema_file("manifest.json"))["columns"]}
     meanings["success"] = "whether the goal was reached: false"
-    for key, dtype in provenance_of(extras).items():
+    for key, dtype in content.provenance.items():
         doc = meanings[key]
         metadata[key] = tfds.features.Text(doc=doc) if dtype == "string" else scalar(np.dtype(dtype), doc=doc)
-    metadata |= {f"{view}_{name}": _tensor(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
-    if named(extras):
+    metadata |= {f"{view}_{name}": _tensor(getattr(SCHEMA, name)) for view in content.views for name in MATRICES}
+    if content.has_names:
         metadata["instances"] = tfds.features.Text(doc="JSON list of names; segmentation and poses have places in it")
     return tfds.features.FeaturesDict({"steps": tfds.features.Dataset(step), "episode_metadata": metadata})
 
@@ -133,16 +132,18 @@ def _tensor(spec: VectorSpec | MatrixSpec) -> Any:
     return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=spec.meaning + names)
 
 
-def _map(spec: MapSpec) -> Any:
-    height, width, _ = SCHEMA.frame.shape
+def _map(spec: MapSpec, content: Content) -> Any:
     return tfds.features.Image(
-        shape=(height, width, 1), dtype=np.dtype(spec.dtype), encoding_format=spec.encoding, doc=spec.meaning
+        shape=(content.size_px, content.size_px, 1),
+        dtype=np.dtype(spec.dtype),
+        encoding_format=spec.encoding,
+        doc=spec.meaning,
     )
 
 
 @cache
-def _serializer(extras: tuple[Extra, ...] = ()) -> Any:
-    return tfds.core.ExampleSerializer(features(extras).get_serialized_info())
+def _serializer(content: Content = STANDARD) -> Any:
+    return tfds.core.ExampleSerializer(features(content).get_serialized_info())
 
 
 def _nested_example(episode: Episode) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 from pipeline.axes import Perturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import STANDARD
 from pipeline.seeding import digest
 
 
@@ -16,7 +16,7 @@ class Stream:
     """View under the perturbations that show in it.
 
     Attributes:
-        view: ``image`` or ``wrist_image``.
+        view: its name in ``schemas/episode.json``, such as ``image``.
         perturbations: render and pixel layers, in the order they apply.
     """
 
@@ -48,10 +48,10 @@ class Stream:
 
 
 @lru_cache(maxsize=65536)
-def streams_of(perturbations_json: str) -> Mapping[str, Stream]:
-    """Map each view name to the stream that shows it, for an episode with these perturbations."""
+def streams_of(perturbations_json: str, views: tuple[str, ...] = STANDARD.views) -> Mapping[str, Stream]:
+    """Map the name of each view to the stream that shows it, for an episode with these perturbations."""
     visible = [p for p in from_json(perturbations_json) if isinstance(p, RenderPerturbation | PixelPerturbation)]
     streams = {}
-    for view in SCHEMA.views:
+    for view in views:
         streams[view] = Stream(view, tuple(p for p in visible if view in p.views))
     return streams

@@ -228,7 +228,7 @@ def _axes(kept: Iterable[Mapping[str, Any]], shown: AnyFormat) -> dict[str, dict
 def _changes(change: Perturbation, shown: AnyFormat) -> str:
     if change.layer == Layer.TEXT:
         return "the instruction"
-    views = " and ".join(f"`{shown.keys[view]}`" for view in SCHEMA.views if view in change.views)
+    views = " and ".join(f"`{shown.keys[view]}`" for view in shown.content.views if view in change.views)
     return f"{views}, the states and the length" if change.layer == Layer.PHYSICS else views
 
 

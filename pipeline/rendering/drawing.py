@@ -13,7 +13,7 @@ from mujoco import gl_context
 from numpy.typing import NDArray
 
 from pipeline import gl
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SIZE_PX
 from pipeline.rendering.opengl import check, making_context
 from pipeline.types import Frame
 
@@ -46,6 +46,10 @@ class PlainDrawing:
 
     Close it before you create the next ``PlainDrawing``.
 
+    Args:
+        model: the model, which must not be replaced.
+        size_px: height and width of its frames.
+
     Attributes:
         steps_ahead: number of steps, of up to two views each, to start by ``start_frame`` before the frames of an
             earlier step are taken; 0 if the device does not work meanwhile.
@@ -61,11 +65,13 @@ class PlainDrawing:
         """Return whether this class can render a model; ``PlainDrawing`` can render every model."""
         return True
 
-    def __init__(self, model: mujoco.MjModel):
+    def __init__(self, model: mujoco.MjModel, size_px: int = SIZE_PX):
         gl.prepare()
-        height, width, _ = SCHEMA.frame.shape
-        self._model, self._rectangle = model, mujoco.MjrRect(0, 0, width, height)
-        self._gl = gl_context.GLContext(width, height)
+        self.size_px = size_px
+        self._model, self._rectangle = model, mujoco.MjrRect(0, 0, size_px, size_px)
+        # MuJoCo's off-screen buffer has 640 x 480 pixels by default.
+        model.vis.global_.offheight = max(model.vis.global_.offheight, size_px)
+        self._gl = gl_context.GLContext(size_px, size_px)
         with ExitStack() as undo:
             # The driver has a limited number of OpenGL contexts, so free the context after an error.
             undo.callback(self._gl.free)
@@ -162,7 +168,7 @@ class PlainDrawing:
         check("mjr_render")
 
     def _pixels(self) -> Frame:
-        frame = np.empty(SCHEMA.frame.shape, np.uint8)
+        frame = np.empty((self.size_px, self.size_px, 3), np.uint8)
         mujoco.mjr_readPixels(frame, None, self._rectangle, self._context)
         check("mjr_readPixels")
         return frame

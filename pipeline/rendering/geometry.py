@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, SCHEMA
+from pipeline.episode_schema import ALL_VIEWS, MAPS, SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero import bddl
@@ -92,7 +92,7 @@ def see(
     The geometry has the camera matrices. With extras, it also has depth, and segmentation by the ids of ``instances``,
     before each executed action.
     """
-    view = SCHEMA.views[stream.view]
+    view = ALL_VIEWS[stream.view]
     maps: dict[Extra, list[bytes]] = {name: [] for name in MAPS if name in extras}
     with renderer.perturbed(stream.changes):
         renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
@@ -114,11 +114,10 @@ def matrices(renderer: Renderer, view: str) -> tuple[NDArray[np.float32], NDArra
     are exchanged. A rotation cannot mirror, so fx is negative.
     """
     model, data = renderer.model, renderer.data
-    spec = SCHEMA.views[view]
-    height, width, _ = SCHEMA.frame.shape
+    spec, size_px = ALL_VIEWS[view], renderer.drawing.size_px
     camera = model.camera(spec.camera).id
-    focal_px = height / 2 / np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
-    intrinsics = np.array([[-focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    focal_px = size_px / 2 / np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
+    intrinsics = np.array([[-focal_px, 0.0, (size_px - 1) / 2], [0.0, focal_px, (size_px - 1) / 2], [0.0, 0.0, 1.0]])
     # MuJoCo's cameras have y up and look along -z.
     extrinsics = _pose(data.cam_xmat[camera].reshape(3, 3) * [1.0, -1.0, -1.0], data.cam_xpos[camera])
     if spec.seen_from == "end_effector":

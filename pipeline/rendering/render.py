@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.axes import PixelPerturbation, of_layer
 from pipeline.config import RenderConfig
-from pipeline.episode_schema import SCHEMA, named
+from pipeline.episode_schema import ALL_VIEWS
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.physics.controller_goals import absolute_actions, first_posture
@@ -33,10 +33,11 @@ def render(
     """Render the streams of one trajectory of a task: the frame before each executed action.
 
     Streams with equal render perturbations share a scene and its clean frames. A stream is rejected, with a reason, if
-    the first frame of its scene is rejected (``FirstFrame``). Streams that differ only in colours share their geometry.
+    the scene lacks its camera or the first frame of its scene is rejected (``FirstFrame``). Streams that differ only in
+    colours share their geometry.
     """
-    renderer = opened.renderer(trajectory.model_xml)
-    instances = Instances(renderer.model, trajectory, task) if named(render_config.extras) else None
+    renderer = opened.renderer(trajectory.model_xml, render_config.size_px)
+    instances = Instances(renderer.model, trajectory, task) if render_config.content.has_names else None
     steps = range(len(trajectory.actions))
     renderer.restore(first_posture(trajectory.scene, renderer.model), trajectory.site_alpha[0])
     first_grip = grip_pose(renderer.data)
@@ -52,7 +53,11 @@ def render(
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
     encoded: dict[str, list[Jpeg]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}
-    for changes, scene in grouped((stream.changes, stream) for stream in streams).items():
+    for stream in streams:
+        if not renderer.has_camera(ALL_VIEWS[stream.view].camera):
+            rejected[stream.stream_id] = "camera_missing"
+    visible = [stream for stream in streams if stream.stream_id not in rejected]
+    for changes, scene in grouped((stream.changes, stream) for stream in visible).items():
         with renderer.perturbed(changes):
             fault = first_frame.fault(scene)
             if fault:
@@ -116,7 +121,7 @@ def _start(renderer: Renderer, state: Floats, site_alpha: NDArray[np.float32], s
     """Start to render the clean frame of each view of a state."""
     renderer.restore(state, site_alpha)
     views = dict.fromkeys(stream.view for stream in streams)
-    return {view: renderer.start_frame(SCHEMA.views[view].camera) for view in views}
+    return {view: renderer.start_frame(ALL_VIEWS[view].camera) for view in views}
 
 
 def _finished(started: Started, streams: Sequence[Stream], step: int) -> list[Frame]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import RenderPerturbation
+from pipeline.episode_schema import SIZE_PX
 from pipeline.rendering.drawing import PlainDrawing, Surfaces, texels
 from pipeline.rendering.savings import drawing_of
 from pipeline.scenes.compiled import compiled
@@ -23,16 +24,17 @@ class Renderer:
     Args:
         scene: the scene's MJCF, or a compiled model, which then belongs to the renderer.
         drawing: an open ``PlainDrawing`` of the model; by default it is created.
+        size_px: height and width of the frames of a created drawing.
 
     Attributes:
         site_alpha: (nsite,) the sites' opacity in the first state.
     """
 
-    def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None):
+    def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None, size_px: int = SIZE_PX):
         self.model = compiled(scene) if isinstance(scene, str) else scene
         self.site_alpha = self.model.site_rgba[:, 3].copy()
         self.data = mujoco.MjData(self.model)
-        self.drawing = drawing or drawing_of(self.model)
+        self.drawing = drawing or drawing_of(self.model, size_px)
         self._perturbations: tuple[RenderPerturbation, ...] = ()
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
@@ -40,6 +42,10 @@ class Renderer:
         State.of(state, self.model.nq).put_into(self.data)
         self.model.site_rgba[:, 3] = site_alpha
         mujoco.mj_forward(self.model, self.data)
+
+    def has_camera(self, camera: str) -> bool:
+        """Return whether the scene has a camera of this name."""
+        return bool(mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, camera) >= 0)
 
     def frame(self, camera: str) -> Frame:
         """Render a frame (H, W, 3) of uint8 RGB of the restored state, oriented like LIBERO's raw observations."""
@@ -108,24 +114,26 @@ class LastScene:
         self._renderer: Renderer | None = None
         self._scene: str | mujoco.MjModel | None = None
 
-    def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
+    def renderer(self, scene: str | mujoco.MjModel, size_px: int = SIZE_PX) -> Renderer:
         """Return the renderer of a scene.
 
-        A request for another scene makes the returned renderer unusable.
+        A request for another scene or size makes the returned renderer unusable.
 
         Args:
             scene: the scene's MJCF, or a compiled model, which must not change while its renderer is used.
+            size_px: height and width of the frames.
 
         Raises:
             PipelineError: if this machine cannot render.
             ValueError: if MuJoCo rejects the scene or one of its images.
         """
-        is_open = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
-        if self._renderer is not None and is_open:
+        is_scene = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
+        has_size = self._renderer is not None and self._renderer.drawing.size_px == size_px
+        if self._renderer is not None and is_scene and has_size:
             return self._renderer
         model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         try:
-            adopted = self._renderer is not None and self._renderer.drawing.adopt(model)
+            adopted = self._renderer is not None and has_size and self._renderer.drawing.adopt(model)
         except BaseException:
             # The context may have parts of both scenes now.
             self.close()
@@ -134,7 +142,7 @@ class LastScene:
             self._renderer = Renderer(model, self._renderer.drawing)
         else:
             self.close()
-            self._renderer = Renderer(model)
+            self._renderer = Renderer(model, size_px=size_px)
             # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
             atexit.register(self.close)
         self._scene = scene

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from pipeline import gl
+from pipeline.episode_schema import SIZE_PX
 from pipeline.errors import PipelineError
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.types import Frame
@@ -71,14 +72,14 @@ SCENE = f"""
 </mujoco>"""
 
 
-def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
+def drawing_of(model: mujoco.MjModel, size_px: int = SIZE_PX) -> PlainDrawing:
     """Create the ``PlainDrawing`` of a model, with savings if they can be used."""
-    if why_plain() is None:
+    if why_plain(size_px) is None:
         kind = kind_with_savings(gl.choose())
         if kind.possible(model):
-            return kind(model)
+            return kind(model, size_px)
         _say("a scene has height fields, skins, an unbounded floor, or another number than four samples a pixel")
-    return PlainDrawing(model)
+    return PlainDrawing(model, size_px)
 
 
 def kind_with_savings(choice: gl.GlChoice) -> type[PlainDrawing]:
@@ -101,8 +102,8 @@ def kind_with_savings(choice: gl.GlChoice) -> type[PlainDrawing]:
 
 
 @functools.cache
-def why_plain() -> str | None:
-    """Return the reason why this process renders plainly; ``None`` if it uses savings.
+def why_plain(size_px: int = SIZE_PX) -> str | None:
+    """Return the reason why this process renders frames of a size plainly; ``None`` if it uses savings.
 
     Log the reason if savings would make rendering faster.
     """
@@ -116,7 +117,7 @@ def why_plain() -> str | None:
     elif importlib.util.find_spec("pipeline.rendering.software") is None:
         reason = "this installation has no savings"
     else:
-        difference = fault(kind_with_savings(gl.choose()))
+        difference = fault(kind_with_savings(gl.choose()), size_px)
         if difference is None:
             return None
         reason = f"on {device} {difference}"
@@ -130,10 +131,10 @@ def _say(reason: str) -> None:
     logging.getLogger(__name__).warning("rendering optimizations are disabled: %s", reason)
 
 
-def fault(kind: type[PlainDrawing]) -> str | None:
+def fault(kind: type[PlainDrawing], size_px: int = SIZE_PX) -> str | None:
     """Return the error or the difference that savings of a kind cause here; ``None`` if all pixels are equal."""
     try:
-        plain, saving = frames(PlainDrawing), frames(kind)
+        plain, saving = frames(PlainDrawing, size_px), frames(kind, size_px)
     except PipelineError as error:
         return f"OpenGL rejects a command of the savings: {error.what}"
     frame_pairs = zip(plain, saving, strict=True)
@@ -141,11 +142,11 @@ def fault(kind: type[PlainDrawing]) -> str | None:
     return f"{differing} of {len(plain)} frames of a small scene have other pixels" if differing else None
 
 
-def frames(kind: type[PlainDrawing]) -> list[Frame]:
+def frames(kind: type[PlainDrawing], size_px: int = SIZE_PX) -> list[Frame]:
     """Render the small scene in all states by one kind of ``PlainDrawing``."""
     model = mujoco.MjModel.from_xml_string(SCENE)
     data, started = mujoco.MjData(model), []
-    with closing(kind(model)) as drawing:
+    with closing(kind(model, size_px)) as drawing:
         for shadows in (0, 1):
             model.light_castshadow[1] = shadows
             for state in range(STATES):

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.axes import RenderPerturbation
 from pipeline.axes.camera import CameraPerturbation, Component
 from pipeline.axes.light import exposure
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, SIZE_PX
 from pipeline.libero import bddl
 from pipeline.planning.streams import Stream
 from pipeline.rendering.renderer import Renderer
@@ -37,6 +37,8 @@ Each camera is measured over the starter demonstration of its task (``benchmarks
 class Sight:
     """Visible things in one camera's view.
 
+    Numbers of pixels are those of a frame of 256 x 256, whatever the size of the frames.
+
     Attributes:
         things_px: thing to the number of pixels that show it in the restored state.
         hand_outside: share of an episode's steps at which the hand is outside of the frame.
@@ -59,7 +61,8 @@ class Sight:
         model, data = renderer.model, renderer.data
         seen = renderer.geoms(CAMERA)
         bodies = model.geom_bodyid[seen[seen >= 0]]
-        trees = np.bincount(model.body_rootid[bodies], minlength=model.nbody)
+        pixels = np.bincount(model.body_rootid[bodies], minlength=model.nbody)
+        trees = np.rint(pixels * (SIZE_PX / renderer.drawing.size_px) ** 2).astype(int)
         camera = model.camera(CAMERA).id
         things = bddl.read(task.bddl_file).things_of_interest
         # A camera looks along its -z axis.
@@ -108,7 +111,9 @@ class FirstFrame:
         self._renderer.restore(*self._first)
         changes = streams[0].changes
         faults: list[str] = []
-        cameras = dict.fromkeys(SCHEMA.views[stream.view].camera for stream in streams)
+        # A view that a policy of LIBERO does not have decides nothing.
+        judged_views = [stream.view for stream in streams if stream.view in SCHEMA.views]
+        cameras = dict.fromkeys(SCHEMA.views[view].camera for view in judged_views)
         if changes:
             for camera in cameras:
                 exposure_fault = exposure(self._renderer.frame(camera))

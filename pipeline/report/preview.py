@@ -16,7 +16,6 @@ from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPer
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
-from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import replaced
 from pipeline.grouping import grouped
@@ -46,7 +45,7 @@ SHOWN_LEVEL = 3
 CANDIDATES = 200
 """Number of the plan's first perturbations from which the variants are chosen; most take under a millisecond."""
 
-SIDE_PX = {1: 256, 2: 192}
+SIDE_PX = {1: 256, 2: 192, 3: 144, 4: 128, 5: 112, 6: 96}
 """Width of a frame, by the number of views of a tile."""
 REFUSED_GREY = (160, 160, 160)
 
@@ -222,7 +221,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     for perturbations in drawn:
         changed.update(*(p.views for p in perturbations))
     changed = changed or {"image"}
-    views = [view for view in SCHEMA.views if view in changed]
+    views = [view for view in config.render.content.views if view in changed]
     side = SIDE_PX[len(views)]
     original = stage.frames(views)
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 
 from pipeline.axes import AXES, from_json
 from pipeline.axes.report_data import CLEAN, KeptPerturbation
-from pipeline.episode_schema import SCHEMA
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import decode
 from pipeline.libero.tasks import find_task
@@ -198,7 +197,7 @@ class _Observed:
         frames = self._seen.load(self._row.episode_id).frames
         twin_frames = self._seen.load(self._twin.episode_id).frames
         differences = {}
-        for view in SCHEMA.views:
+        for view in frames:
             differences[view] = np.abs(decode(frames[view][0]).astype(float) - decode(twin_frames[view][0]))
         return differences
 

@@ -127,12 +127,12 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
     """Return the ids of the trajectories that a plan may need, and pairs of trajectory id and id of a needed stream."""
     config = run.config
     verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
-    frames = frames_by_trajectory(run.frames.rows())
-    rejected = rejections(rows, frames)
+    frames, views = frames_by_trajectory(run.frames.rows()), config.render.content.views
+    rejected = rejections(rows, frames, views)
     undecided = Verdict(False, NOT_REPLAYED)
     # A reserve is needed unless the candidates before it are replayed, rendered and kept.
     verdict_of = {row.trajectory_id: verdicts.get(row.trajectory_id, undecided) for row in rows}
-    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not rendered(row, frames)}
+    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not rendered(row, frames, views)}
     judged = select(rows, verdict_of, not_rendered | rejected)
     trajectories: set[str] = set()
     streams: set[tuple[str, str]] = set()
@@ -143,7 +143,8 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
             continue
         trajectories.add(row.trajectory_id)
         if verdict.kept or verdict.reason in (NOT_REPLAYED, rejected.get(row.episode_id), *failures):
-            streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations).values()}
+            row_streams = streams_of(row.perturbations, views).values()
+            streams |= {(row.trajectory_id, stream.stream_id) for stream in row_streams}
     return trajectories, streams
 
 

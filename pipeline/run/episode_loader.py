@@ -6,7 +6,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 from pipeline.config import RenderConfig
-from pipeline.episode_schema import provenance_of
+from pipeline.episode_schema import Content
 from pipeline.files import Edition, edition
 from pipeline.identity import versions
 from pipeline.libero.tasks import find_task
@@ -15,7 +15,7 @@ from pipeline.planning.streams import streams_of
 from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Episode, Extra, Subtask
+from pipeline.types import Episode, Subtask
 
 
 @dataclass(frozen=True)
@@ -23,14 +23,20 @@ class EpisodeLoader:
     """Loader of rendered episodes by id, small enough to send to a worker, which reads the plan once itself.
 
     Attributes:
-        extras: ``outcome`` for failures.
+        failures: True for failures, which have further columns.
         rewrites: episode id to other wordings of its task. Episodes get rewrites and subtasks only if it is set.
     """
 
     data: Path
     render_config: RenderConfig
-    extras: tuple[Extra, ...] = ()
+    failures: bool = False
     rewrites: Mapping[str, Sequence[str]] | None = None
+
+    @cached_property
+    def content(self) -> Content:
+        """Content of the episodes."""
+        content = self.render_config.content
+        return content.including("outcome") if self.failures else content
 
     @cached_property
     def _frames(self) -> FrameStore:
@@ -38,14 +44,14 @@ class EpisodeLoader:
 
     def __call__(self, episode_id: str) -> Episode:
         row = _rows_by_id(edition(self.data / PLAN))[episode_id]
-        streams = streams_of(row.perturbations)
+        streams = streams_of(row.perturbations, self.content.views)
         stream_ids = [stream.stream_id for stream in streams.values()]
         geometry = {view: stream.geometry.stream_id for view, stream in streams.items()}
         rendered = self._frames.load(row.trajectory_id, stream_ids, set(geometry.values()))
         values = asdict(row) | {"replay_mode": rendered.replay_mode}
         values |= asdict(rendered.quality) if rendered.quality else {}
         values |= {f"{name}_version": version for name, version in versions().items()}
-        if "outcome" in self.extras:
+        if self.failures:
             verdict = TrajectoryStore(self.data / TRAJECTORIES).load(row.trajectory_id).verdict
             values |= {"success": verdict.kept, "reason": verdict.reason}
         episode = Episode(
@@ -56,7 +62,7 @@ class EpisodeLoader:
             action=rendered.action,
             action_absolute=rendered.action_absolute,
             instruction=row.instruction,
-            provenance={name: values[name] for name in provenance_of(self.extras)},
+            provenance={name: values[name] for name in self.content.provenance},
             geometry={view: rendered.geometry[name] for view, name in geometry.items()},
             object_poses=rendered.object_poses,
             instances=rendered.instances,

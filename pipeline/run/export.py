@@ -41,7 +41,6 @@ from pipeline.run.outcome import shuffled
 from pipeline.run.run import Run
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
-from pipeline.types import Extra
 
 AnyFormat = Format[Any]
 
@@ -70,7 +69,7 @@ def export_run(kind: type[AnyFormat], run: Run) -> None:
 
 def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     refuse_foreign(target, episodes)
-    if not episodes.ids and "outcome" in target.extras:
+    if not episodes.ids and "outcome" in target.content.extras:
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
         print(f"no replay missed its goal, so {target.folder} was not written")
@@ -126,7 +125,7 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     If the format takes ``language``, the episodes have subtasks and rewrites: all rewrites that the run's language axis
     may sample for the episode. Without this axis, its default ranges decide.
     """
-    failures = "outcome" in target.extras
+    failures = "outcome" in target.content.extras
     rewrites: dict[str, tuple[str, ...]] | None = {} if target.language else None
     outcome, language = run.outcome, run.config.plan.axes.language
     episodes: dict[str, Known] = {}
@@ -137,8 +136,7 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
             content = digest(content, rewrites[episode_id])[:16]
         steps = outcome.trajectories[row.trajectory_id]["steps"]
         episodes[episode_id] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
-    extras: tuple[Extra, ...] = ("outcome",) if failures else ()
-    return Episodes(episodes, run.episodes(extras=extras, rewrites=rewrites))
+    return Episodes(episodes, run.episodes(failures=failures, rewrites=rewrites))
 
 
 @cache
@@ -161,11 +159,11 @@ def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:
         {package: version(package) for package in target.packages},
         SCHEMA.model_dump(mode="json"),
         _options(target),
-        target.extras,
+        *target.content.stated(),
         [[piece.path, piece.ids] for piece in target.pieces(episodes)],
         contents,
     )
-    requested = digest(_options(target), target.extras, contents)[:16]
+    requested = digest(_options(target), *target.content.stated(), contents)[:16]
     schema = digest(SCHEMA.model_dump(mode="json"))[:8]
     return Basis(identity[:16], requested, {**target.made_with(), "episode schema": schema})
 

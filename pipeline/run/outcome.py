@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, FilterConfig
+from pipeline.episode_schema import STANDARD
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import ExportConfig
 from pipeline.planning import plan, selection
@@ -93,18 +94,21 @@ def replayed(
     return trajectories
 
 
-def rejections(rows: Sequence[plan.Row], frames: Mapping[str, StoredFrames]) -> dict[str, str]:
+def rejections(
+    rows: Sequence[plan.Row], frames: Mapping[str, StoredFrames], views: tuple[str, ...] = STANDARD.views
+) -> dict[str, str]:
     """Map the ids of episodes with a rejected stream to the reason of the rejection.
 
     Args:
         frames: trajectory id to the record of its stored frames.
+        views: names of the views of every episode.
     """
     reasons: dict[str, str] = {}
     for row in rows:
         stored = frames.get(row.trajectory_id)
         if stored is None or not stored.rejected:
             continue
-        for stream in streams_of(row.perturbations).values():
+        for stream in streams_of(row.perturbations, views).values():
             if stream.stream_id in stored.rejected:
                 reasons[row.episode_id] = stored.rejected[stream.stream_id]
     return reasons
@@ -117,7 +121,8 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
         PipelineError: when a trajectory or a frame that the plan needs is missing, or can no longer be read.
     """
     stored_frames = frames_by_trajectory(frames.rows())
-    rejected = rejections(rows, stored_frames)
+    views = config.render.content.views
+    rejected = rejections(rows, stored_frames, views)
     replays = replayed(rows, trajectories, rejected, config.filter)
     judged = selection.select(rows, verdicts_of(replays, rows, config.filter), rejected)
     where = config.export.where
@@ -127,7 +132,7 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
                 judged[row.episode_id] = Verdict(False, LEFT_OUT)
     failures = [row for row in missed(rows, judged, config.export) if row.episode_id not in rejected]
     kept = [row for row in rows if judged[row.episode_id].kept]
-    not_rendered = [row for row in (*kept, *failures) if not rendered(row, stored_frames)]
+    not_rendered = [row for row in (*kept, *failures) if not rendered(row, stored_frames, views)]
     folders = dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)
     _refuse_missing(list(folders), "render")
     return Outcome(rows, replays, stored_frames, judged, [row.episode_id for row in failures])
@@ -144,9 +149,9 @@ def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: Expo
     return [row for row in failures if where.takes(row.axis, row.component, row.level, row.suite)]
 
 
-def rendered(row: plan.Row, frames: Mapping[str, StoredFrames]) -> bool:
-    """Return whether the frames that an episode shows are stored."""
-    needed = {stream.stream_id for stream in streams_of(row.perturbations).values()}
+def rendered(row: plan.Row, frames: Mapping[str, StoredFrames], views: tuple[str, ...] = STANDARD.views) -> bool:
+    """Return whether the frames of an episode's views are stored."""
+    needed = {stream.stream_id for stream in streams_of(row.perturbations, views).values()}
     return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams
 
 

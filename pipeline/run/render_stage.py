@@ -68,12 +68,11 @@ def render_plan(
     """
     device = gl.choose().device
     judged = verdicts_of(trajectories.rows(), rows, config.filter)
+    views, failures = config.render.content.views, MISSED if config.export.failures else ()
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in frames.refresh().items() if row["device"] == device}
-        needed = _needed(
-            rows, judged, rejections(rows, frames_by_trajectory(stored)), MISSED if config.export.failures else ()
-        )
+        needed = _needed(rows, judged, rejections(rows, frames_by_trajectory(stored), views), views, failures)
         missing = {name: portion for name, portion in needed.items() if name not in stored}
         if not missing:
             return set(needed)
@@ -103,13 +102,18 @@ def render_plan(
 
 
 def _needed(
-    rows: Sequence[Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str], failures: Collection[str]
+    rows: Sequence[Row],
+    judged: Mapping[str, Verdict],
+    rejected: Mapping[str, str],
+    views: tuple[str, ...],
+    failures: Collection[str],
 ) -> dict[str, Portion]:
     """Map the name of each file that the plan needs to its portion, by the verdicts and rejections so far.
 
     Args:
         judged: trajectory id to its verdict.
         rejected: episode id to the reason why its frames were rejected.
+        views: names of the views of every episode.
         failures: reasons of dropped episodes that are rendered too.
     """
     # Episodes of a trajectory share its replay and its files, so any of their rows names its demonstration and task.
@@ -118,7 +122,7 @@ def _needed(
     needed: dict[str, set[str]] = {}
     outcome = select(rows, judged, rejected)
     for row in rows:
-        streams = {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+        streams = {stream.stream_id: stream for stream in streams_of(row.perturbations, views).values()}
         planned[row.trajectory_id] |= streams
         verdict = outcome[row.episode_id]
         # A rejected stream stays needed: without it, its episode would be tried again.

@@ -17,7 +17,6 @@ from pipeline.run.layout import FRAMES, MANIFEST, PLAN, REPORT, TRAJECTORIES, VA
 from pipeline.run.outcome import Outcome
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Extra
 
 AnyFormat = Format[Any]
 
@@ -106,7 +105,7 @@ class Run:
     @property
     def formats(self) -> list[AnyFormat]:
         """Datasets that the configuration requests."""
-        return self.config.export.datasets(self.folder, self.config.render.extras)
+        return self.config.export.datasets(self.folder, self.config.render.content)
 
     def dataset(self, name: str) -> AnyFormat:
         """Return the dataset of a format that the configuration requests, such as ``rlds``."""
@@ -116,7 +115,7 @@ class Run:
     @property
     def failure_formats(self) -> list[AnyFormat]:
         """Datasets of failures that the configuration requests."""
-        return self.config.export.failure_datasets(self.folder, self.config.render.extras)
+        return self.config.export.failure_datasets(self.folder, self.config.render.content)
 
     @property
     def recorded_formats(self) -> list[AnyFormat]:
@@ -124,11 +123,9 @@ class Run:
         recorded_failures = [dataset for dataset in self.failure_formats if dataset.record_file.exists()]
         return [*self.formats, *recorded_failures]
 
-    def episodes(
-        self, extras: tuple[Extra, ...] = (), rewrites: Mapping[str, Sequence[str]] | None = None
-    ) -> EpisodeLoader:
-        """Return the loader of rendered episodes; for ``extras`` and ``rewrites`` see ``EpisodeLoader``."""
-        return EpisodeLoader(self.folder, self.config.render, extras, rewrites)
+    def episodes(self, *, failures: bool = False, rewrites: Mapping[str, Sequence[str]] | None = None) -> EpisodeLoader:
+        """Return the loader of rendered episodes; for ``failures`` and ``rewrites`` see ``EpisodeLoader``."""
+        return EpisodeLoader(self.folder, self.config.render, failures, rewrites)
 
     def workers(self, *, renders: bool = False) -> AbstractContextManager[Workers]:
         """Start the workers of the section ``compute``, which stop when the context ends."""

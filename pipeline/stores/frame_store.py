@@ -51,7 +51,7 @@ class FrameStore(Store):
     ``streams`` (ids of the rendered streams). The column ``rejected`` is JSON, the id of each rejected stream to the
     reason. A file's name is ``<trajectory id>/<digest of its streams>``.
 
-    Frames that were encoded with another ``render_config`` count as missing.
+    Frames that were encoded with another ``render_config`` count as missing. Further views are streams of their own.
     """
 
     step, stage, pattern = "encoding", "render", f"*/*{SUFFIX}"
@@ -66,7 +66,8 @@ class FrameStore(Store):
     def __init__(self, root: Path, render_config: RenderConfig):
         schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
         maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*render_config.extras} else {}
-        super().__init__(root, render_config.model_dump(mode="json"), {"episode schema": schema, **maps})
+        settings = render_config.model_dump(mode="json", exclude={"views"})
+        super().__init__(root, settings, {"episode schema": schema, **maps})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:

@@ -22,7 +22,6 @@ import numpy as np
 from pipeline.axes import AXES, Perturbation, PhysicsPerturbation, RenderPerturbation, axes_of
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import Config, DemosConfig, PlanConfig
-from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN
 from pipeline.formats.base import StepSizes
@@ -71,7 +70,8 @@ as 8."""
 
 def needed_mb(config: Config) -> dict[str, float]:
     """Estimate the megabytes that each folder of a run takes."""
-    amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
+    amounts, content = Amounts.of(lengths(config.demos), config.plan), config.render.content
+    views = len(content.views)
     twins, _, twin_steps, mean_steps = amounts
     episodes, steps = _exported(config, amounts)
     # Trajectories, and views of frames and of maps, that planned episodes do not share with their clean twins.
@@ -79,11 +79,11 @@ def needed_mb(config: Config) -> dict[str, float]:
     for number, kinds in _planned(config.plan):
         physics = any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         trajectories += number * (1 + config.plan.reserve) * physics
-        frames += number * _changed_views(kinds)
-        maps += number * _changed_views([kind for kind in kinds if _seen_otherwise(kind)])
-    frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
-    map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
-    poses_kb = POSES_KB if "object_poses" in extras else 0.0
+        frames += number * _changed_views(kinds, content.views)
+        maps += number * _changed_views([kind for kind in kinds if _seen_otherwise(kind)], content.views)
+    frame_kb = content.area * float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
+    map_kb = content.area * sum(MAP_KB[extra] for extra in content.extras if extra in MAP_KB)
+    poses_kb = POSES_KB if "object_poses" in content.extras else 0.0
 
     needed_kb = {
         "trajectories": (twins + trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
@@ -92,7 +92,7 @@ def needed_mb(config: Config) -> dict[str, float]:
         + amounts.steps * (poses_kb + MOTION_KB),
     }
     sizes = StepSizes(frame_kb, map_kb, poses_kb, MOTION_KB)
-    for dataset in config.export.datasets(config.data, extras):
+    for dataset in config.export.datasets(config.data, content):
         needed_kb[dataset.name] = steps * dataset.step_kb(sizes) + episodes * EPISODE_KB
     return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
 
@@ -113,15 +113,18 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
     drawn_s = np.average([ARENAS[arena].frame_s for arena in arenas], axis=0, weights=weights)
     slower = speed.frame_s / REFERENCE.frame_s
-    frame_s = [float(s) * slower for s in drawn_s]
+    content = config.render.content
+    agent_s, wrist_s = (float(s) * slower for s in drawn_s)
+    # A further view takes about as long as the agent view.
+    frame_s = [agent_s, wrist_s, *[agent_s] * (len(content.views) - 2)]
     if speed.gpus:
-        frame_s = [_gpu_frame_s(config.compute, speed)] * len(drawn_s)
-    maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in config.render.extras)
+        frame_s = [_gpu_frame_s(config.compute, speed)] * len(content.views)
+    maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in content.extras)
     trajectories, rendered_s = amounts.twins, amounts.twin_steps * sum(view_s + maps_s for view_s in frame_s)
     encoded_s = amounts.twin_steps * len(frame_s) * ENCODE_S
     for episodes, kinds in _planned(config.plan):
         trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
-        for view, view_s in zip(SCHEMA.views, frame_s, strict=True):
+        for view, view_s in zip(content.views, frame_s, strict=True):
             here = [kind for kind in kinds if view in kind.views]
             rendered = any(issubclass(kind, PhysicsPerturbation | RenderPerturbation) for kind in here)
             mapped = any(_seen_otherwise(kind) for kind in here)
@@ -129,7 +132,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
             rendered_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + maps_s * mapped)
             encoded_s += episodes * amounts.mean_steps * ENCODE_S * bool(here)
     processor = speed.step_s / REFERENCE.step_s
-    datasets = config.export.datasets(config.data, config.render.extras)
+    datasets = config.export.datasets(config.data, content)
     _, exported_steps = _exported(config, amounts)
     return {
         "replay": trajectories * replay_s(amounts.mean_steps, speed),
@@ -213,9 +216,9 @@ def _planned(plan: PlanConfig) -> Iterator[tuple[int, list[type[Perturbation]]]]
         yield episodes, [AXES[axis].draws[0] for axis in axes_of(name)]
 
 
-def _changed_views(kinds: Iterable[type[Perturbation]]) -> int:
+def _changed_views(kinds: Iterable[type[Perturbation]], views: Iterable[str]) -> int:
     """Count the views that show at least one of the perturbations."""
-    return len(set(chain.from_iterable(kind.views for kind in kinds)))
+    return len(set(views) & set(chain.from_iterable(kind.views for kind in kinds)))
 
 
 def _casts_shadows(kind: type[Perturbation]) -> bool:

@@ -128,13 +128,14 @@ def _rebuild(
     verdict = replay(planned)
     if not verdict.kept:
         return None, verdict.reason
-    streams = tuple(streams_of(planned.perturbations).values())
+    content = settings.render.content
+    streams = tuple(streams_of(planned.perturbations, content.views).values())
     RenderJob(planned, streams, trajectories, frames, settings.render, gl.choose().device)()
     rejected = frames_by_trajectory(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected
     if rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(out, settings.render)
-    rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)
+    rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), content)
     export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")
     return _record(shard, 0), "kept"

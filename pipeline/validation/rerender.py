@@ -45,9 +45,9 @@ def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iter
     """
     exact = case.row["gl_device"] == gl.choose().device
     for step in dict.fromkeys((0, len(case.made) // 2)):
-        fresh = _raw(case, opened, step)
-        former = _raw(case, opened, step - BEFORE) if step > BEFORE else {}
-        for view in SCHEMA.views:
+        fresh = _raw(case, opened, render_config, step)
+        former = _raw(case, opened, render_config, step - BEFORE) if step > BEFORE else {}
+        for view in fresh:
             name = f"{view} of step {step}"
             stored = case.made.frames[view][step]
             again = encode(_turned(fresh[view]), render_config.jpeg_quality)
@@ -88,12 +88,13 @@ def _turned(raw: Frame) -> Frame:
     return np.ascontiguousarray(np.rot90(raw, SCHEMA.image_rotation_deg // 90))
 
 
-def _raw(case: Case, opened: LastScene, step: int) -> dict[str, Frame]:
+def _raw(case: Case, opened: LastScene, render_config: RenderConfig, step: int) -> dict[str, Frame]:
     """Render the frame of each view before a step, in the orientation of LIBERO's raw observations."""
-    renderer, changes = opened.renderer(case.trajectory.model_xml), from_json(case.row["perturbations"])
+    renderer = opened.renderer(case.trajectory.model_xml, render_config.size_px)
+    changes = from_json(case.row["perturbations"])
     with renderer.perturbed(of_layer(changes, RenderPerturbation)):
         renderer.restore(case.trajectory.states[step], case.trajectory.site_alpha[step])
-        frames = {view: renderer.frame(spec.camera) for view, spec in SCHEMA.views.items()}
+        frames = {view: renderer.frame(spec.camera) for view, spec in render_config.content.cameras.items()}
     for noise in of_layer(changes, PixelPerturbation):
         frames |= {view: noise.apply(frames[view], step) for view in noise.views}
     return frames

@@ -34,7 +34,6 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import wordings
 from pipeline.run.layout import COUNTS, STATISTICS, WORK
 from pipeline.run.run import Run
-from pipeline.types import Extra
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import rendered, witnesses
@@ -98,7 +97,7 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
                     episode_id = row["episode_id"]
                     if episode_id in missed:
                         failed[episode_id] = row | places.get(episode_id, {})
-                job = EpisodesJob(run, failures, cache, frozenset([*failed][:1]), ("outcome",))
+                job = EpisodesJob(run, failures, cache, frozenset([*failed][:1]), of_failures=True)
                 total.add(_datasets(job, failed, workers), within=f"{FAILURES}/")
         finally:
             scene_of_process().close()
@@ -125,7 +124,7 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
     work: list[Callable[[], Results]] = []
     for dataset in reversed(job.formats):
         work.append(partial(_as_a_whole, dataset, episodes, job.cache))
-    if "outcome" not in job.extras and any(dataset.name == "rlds" for dataset in job.formats):
+    if not job.of_failures and any(dataset.name == "rlds" for dataset in job.formats):
         statistics = read_json(job.run.path(STATISTICS))
         work += [partial(_openvla_oft, statistics, folder) for folder in datasets(job.run.dataset("rlds").folder)]
     work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
@@ -212,21 +211,21 @@ class EpisodesJob:
         formats: the datasets that can be opened.
         cache: folder for temporary files of the readers.
         witnesses: ids of the episodes to render again.
-        extras: ``outcome`` for failures.
+        of_failures: True if the episodes missed their goal.
     """
 
     run: Run
     formats: Sequence[Format[Any]]
     cache: Path
     witnesses: frozenset[str]
-    extras: tuple[Extra, ...] = ()
+    of_failures: bool = False
 
     def __call__(self, rows: Sequence[Row]) -> Results:
         results, rewrites = Results(), None
         if any(dataset.language for dataset in self.formats):
             language = self.run.config.plan.axes.language
             rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
-        load = self.run.episodes(extras=self.extras, rewrites=rewrites)
+        load = self.run.episodes(failures=self.of_failures, rewrites=rewrites)
         for row in rows:
             self._check(row, load, results)
         return results
@@ -254,7 +253,7 @@ class EpisodesJob:
             results.note("stored", [Fault("frames", episode_id, str(error), "the output of the run")])
             return
         results.note("stored", [])
-        if "outcome" in self.extras:  # The manifest has figures of kept episodes only.
+        if self.of_failures:  # The manifest has figures of kept episodes only.
             quality = measure(trajectory, find_task(row["suite"], row["task"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
         language = self.run.config.plan.axes.language

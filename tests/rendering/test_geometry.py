@@ -177,7 +177,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     known = {
         row.episode_id: Known(row.suite, "", row.demo_id, row.instruction, len(load(row.episode_id))) for row in kept
     }
-    for target in config.export.datasets(data, config.render.extras):
+    for target in config.export.datasets(data, config.render.content):
         export(target, Episodes(known, load), loop)
     (data / "config.json").write_text(config.model_dump_json())
     return data
@@ -188,7 +188,7 @@ def cases(data: Path) -> list[Case]:
     config = Config.model_validate_json((data / "config.json").read_text())
     load = EpisodeLoader(data, config.render)
     rows = {row.episode_id: vars(row) for row in plan.read(data / "plan.parquet")}
-    formats = config.export.datasets(data, config.render.extras)
+    formats = config.export.datasets(data, config.render.content)
     places: dict[str, dict[str, Any]] = {}
     for one in formats:
         for episode_id, place in one.record().places.items():

@@ -89,7 +89,7 @@ def test_validate_checks_them_and_finds_a_success_among_them(asked: Path, tmp_pa
         place = table.schema.get_field_index("success")
         pq.write_table(table.set_column(place, table.schema.field("success"), succeeded), file)
         sets = config.export.failure_datasets(config.data)
-        job = EpisodesJob(Run(config), sets, tmp_path / "cache", frozenset(), ("outcome",))
+        job = EpisodesJob(Run(config), sets, tmp_path / "cache", frozenset(), of_failures=True)
         found = job([missed[0] | places(sets)[missed[0]["episode_id"]]]).findings
     told = {check: {fault.dataset for fault in faults} for check, faults in found.items() if faults}
     assert told == {"provenance": {"lerobot"}}

@@ -108,7 +108,7 @@ def test_what_found_something_off_is_not_remembered(config: Config) -> None:
 
 
 def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Config) -> None:
-    for one in config.export.datasets(config.data, config.render.extras):
+    for one in config.export.datasets(config.data, config.render.content):
         content = {name: (one.folder / name).read_bytes() for name in one.record().files}
         name = max(content, key=lambda name: len(content[name]))
         # As in a copy that has the time of the copying.

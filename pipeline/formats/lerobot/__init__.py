@@ -11,14 +11,14 @@ import pyarrow as pa
 from packaging.version import Version
 from pydantic import Field, field_validator
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, GripperSpec
+from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
 from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
 from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Action, Convention, camera_column
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
 from pipeline.tables import column
-from pipeline.types import Count, Extra
+from pipeline.types import Count
 
 EPISODES_OF_A_PIECE = 50
 """Largest number of episodes that are written again after a call was killed; the files do not depend on it."""
@@ -63,6 +63,14 @@ class LeRobotConfig(FormatOptions):
         return language
 
 
+def _keys(convention: Convention, content: Content) -> dict[str, str]:
+    """Return the ``keys`` of a format under the names of v3.0."""
+    keys = {view: spec.lerobot_key for view, spec in content.cameras.items()} | convention.motion_keys
+    for view in content.views:
+        keys |= {f"{view}_{name}": camera_column(view, name) for name in (*MATRICES, *MAPS)}
+    return keys | {"provenance": "meta/provenance.parquet"}
+
+
 class LeRobot(Format[LeRobotConfig]):
     """Dataset in which files of one number hold the same episodes: of data, of each video and of ``meta/episodes``."""
 
@@ -78,17 +86,11 @@ class LeRobot(Format[LeRobotConfig]):
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
-    keys = (
-        {view: spec.lerobot_key for view, spec in SCHEMA.views.items()}
-        | Convention("video").motion_keys
-        | {f"{view}_{name}": camera_column(view, name) for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
-        | {"provenance": "meta/provenance.parquet"}
-    )
     clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
 
-    def __init__(self, data: Path, options: LeRobotConfig, extras: Sequence[Extra] = ()) -> None:
-        super().__init__(data, options, extras)
-        self.keys = {**LeRobot.keys, **self._convention.motion_keys}
+    def __init__(self, data: Path, options: LeRobotConfig, content: Content = STANDARD) -> None:
+        super().__init__(data, options, content)
+        self.keys = _keys(self._convention, content)
 
     @property
     def language(self) -> bool:
@@ -104,7 +106,7 @@ class LeRobot(Format[LeRobotConfig]):
         return self.folder / self.options.name
 
     def step_kb(self, sizes: StepSizes) -> float:
-        return self._convention.step_kb(sizes)
+        return self._convention.step_kb(sizes, self.content)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         """Divide the episodes into pieces, each one file of each kind.
@@ -125,21 +127,22 @@ class LeRobot(Format[LeRobotConfig]):
 
     def _steps_of_a_file(self) -> int:
         """Return the number of steps in a file of ``FILE_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
-        views = len(SCHEMA.views)
-        maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in self.extras)
+        views = len(self.content.views) * self.content.area
+        maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in self.content.extras)
         images_kb = 40.0 if self.options.frames == "images" else 0.0
         data_kb = 0.5 + views * (maps_kb + images_kb)
-        return int(1000 * FILE_MB / max(data_kb, 12.0))
+        video_kb = 6.0 * views
+        return int(1000 * FILE_MB / max(data_kb, video_kb))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats.lerobot import write
 
-        write.write_piece(path, piece, load, self._convention, self.extras)
+        write.write_piece(path, piece, load, self._convention, self.content)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, int]]:
         from pipeline.formats.lerobot import write
 
-        write.finish(work, work / "dataset" / self.options.name, pieces, self._convention, self.extras)
+        write.finish(work, work / "dataset" / self.options.name, pieces, self._convention, self.content)
         ids = [episode_id for piece in pieces for episode_id in piece.ids]
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
@@ -152,12 +155,12 @@ class LeRobot(Format[LeRobotConfig]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats.lerobot import check
 
-        return check.check(self.root, cache, kept, self._convention, self.extras, self.options.validation)
+        return check.check(self.root, cache, kept, self._convention, self.content, self.options.validation)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats.lerobot import read
 
-        return read.read(self.root, row["episode_id"], self.extras, self._convention)
+        return read.read(self.root, row["episode_id"], self.content, self._convention)
 
     def repository_path(self, file: str) -> str:
         # lerobot reads a dataset from the root of the repository.
@@ -246,16 +249,16 @@ class LeRobotV21(Format[LeRobotV21Config]):
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
 
-    def __init__(self, data: Path, options: LeRobotV21Config, extras: Sequence[Extra] = ()) -> None:
-        super().__init__(data, options, extras)
+    def __init__(self, data: Path, options: LeRobotV21Config, content: Content = STANDARD) -> None:
+        super().__init__(data, options, content)
         self.convention = CONVENTIONS[options.convention]
-        self.keys = {name: self.convention.name(key) for name, key in LeRobot.keys.items()}
+        self.keys = {name: self.convention.name(key) for name, key in _keys(self.convention, content).items()}
         if self.convention.open_is_one:
             self.gripper = GripperSpec(open=1.0, close=0.0)
         self.clients = CLIENTS_V21[options.convention]
 
     def step_kb(self, sizes: StepSizes) -> float:
-        return self.convention.step_kb(sizes)
+        return self.convention.step_kb(sizes, self.content)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
@@ -274,13 +277,13 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats.lerobot import write
 
-        write.write_piece_v21(path, piece, load, self.convention, self.extras)
+        write.write_piece_v21(path, piece, load, self.convention, self.content)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
         from pipeline.formats.lerobot import write
 
         for name, members in grouped((Path(piece.path).parent.name, piece) for piece in pieces).items():
-            write.finish_v21(work, work / "dataset" / name, members, self.convention, self.extras)
+            write.finish_v21(work, work / "dataset" / name, members, self.convention, self.content)
         return {}
 
     def open(self) -> None:
@@ -291,12 +294,12 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats.lerobot import check
 
-        return check.check_v21(self.folder, kept, self.convention, self.extras, self.options.validation)
+        return check.check_v21(self.folder, kept, self.convention, self.content, self.options.validation)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats.lerobot import read
 
-        return read.read_v21(self.folder, row["episode_id"], self.convention, self.extras)
+        return read.read_v21(self.folder, row["episode_id"], self.convention, self.content)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         actions = self.keys["action"]

@@ -4,6 +4,7 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -17,7 +18,7 @@ import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, STANDARD, Content
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot.columns import (
     DATA_PATH,
@@ -56,7 +57,6 @@ from pipeline.formats.stated_statistics import (
     unlike_figures,
     wrong_numbers,
 )
-from pipeline.types import Extra
 
 BY_LEROBOT = 8
 """Number of episodes that lerobot reads too, spread over the dataset."""
@@ -70,7 +70,7 @@ def check(
     cache: Path,
     kept: Mapping[str, Row],
     convention: Convention,
-    extras: Sequence[Extra] = (),
+    content: Content = STANDARD,
     validation: float = 0.0,
 ) -> Iterator[tuple[str, Fault]]:
     """Compare a dataset's metadata with the content of its files.
@@ -92,16 +92,16 @@ def check(
     warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
     with readable(root):
         episodes = rows(root)
-        faults = list(_format(root, episodes, convention, extras, validation))
+        faults = list(_format(root, episodes, convention, content, validation))
     # These faults come first, because lerobot may stop at them with a less specific message.
     yield from (("format", fault) for fault in faults)
     with readable(root, also=(DatasetsError,)):
         with local_only(cache):
             data = LeRobotDataset(root.name, root=root, video_backend="pyav")
         stored = (data.meta.total_episodes, data.num_frames)
-        wrong = list(_wrong_statistics(root, convention, extras))
+        wrong = list(_wrong_statistics(root, convention, content))
         split_of = _split_of(root, episodes)
-        samples = list(_samples(root, data, convention))
+        samples = list(_samples(root, data, convention, content))
     for what, expected in wrong:
         yield "format", Fault("lerobot", None, what, expected)
     for episode_id, key in samples:
@@ -117,7 +117,7 @@ def check(
 
 
 def _format(
-    root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention, extras: Sequence[Extra], val: float
+    root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention, content: Content, val: float
 ) -> Iterator[Fault]:
     """Compare the statements of ``meta/`` with the files and with the episodes."""
     info = json.loads((root / "meta" / "info.json").read_text())
@@ -138,14 +138,14 @@ def _format(
     }
     yield from unlike("lerobot", info, wanted)
     yield from unlike("lerobot", {"fields of info.json": sorted(info)}, {"fields of info.json": _fields(wanted)})
-    yield from unlike("lerobot", info["features"], _as_json(convention.described(extras)))
-    unexpected = sorted(info["features"].keys() - convention.columns(extras).keys())
+    yield from unlike("lerobot", info["features"], _as_json(convention.described(content)))
+    unexpected = sorted(info["features"].keys() - convention.columns(content).keys())
     if unexpected:
         yield Fault("lerobot", None, f"info.json describes the columns {unexpected}", "only columns of the data files")
     yield from _wrong_tasks("lerobot", tasks, [row["tasks"][0] for row in episodes.values()])
     yield from _wrong_splits(info["splits"], len(episodes), val)
-    yield from _wrong_modality("lerobot", root, info["features"], convention)
-    yield from _wrong_files(root, episodes, convention)
+    yield from _wrong_modality("lerobot", root, info["features"], convention, content)
+    yield from _wrong_files(root, episodes, convention, content)
     for file in sorted(root.glob("videos/**/*.mp4")):
         yield from _wrong_video("lerobot", file, info["features"][file.parent.parent.name]["info"])
 
@@ -181,11 +181,13 @@ def _split_of(root: Path, episodes: Mapping[str, Mapping[str, Any]]) -> dict[str
     return split_of
 
 
-def _wrong_files(root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention) -> Iterator[Fault]:
+def _wrong_files(
+    root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention, content: Content
+) -> Iterator[Fault]:
     """Compare the existing files with the files that the episodes name."""
     kinds = {"data": ".parquet", "meta/episodes": ".parquet"}
     if convention.frames == "video":
-        kinds |= {f"videos/{view.lerobot_key}": ".mp4" for view in SCHEMA.views.values()}
+        kinds |= {f"videos/{view.lerobot_key}": ".mp4" for view in content.cameras.values()}
     wanted = set()
     for row in episodes.values():
         for kind, suffix in kinds.items():
@@ -199,11 +201,11 @@ def _wrong_files(root: Path, episodes: Mapping[str, Mapping[str, Any]], conventi
     yield from unlike("lerobot", {"files": sorted(existing)}, {"files": sorted(wanted)})
 
 
-def _wrong_statistics(root: Path, convention: Convention, extras: Sequence[Extra]) -> Iterator[tuple[str, str]]:
+def _wrong_statistics(root: Path, convention: Convention, content: Content) -> Iterator[tuple[str, str]]:
     """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
-    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(extras))
-    for view in SCHEMA.views.values():
+    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(content))
+    for view in content.cameras.values():
         column = view.lerobot_key
         names = [f"stats/{column}/{figure}" for figure in (*FIGURES, *QUANTILES)]
         tables = [pq.read_table(file, columns=names) for file in episode_files(root)]
@@ -215,19 +217,19 @@ def _wrong_statistics(root: Path, convention: Convention, extras: Sequence[Extra
         yield from _wrong_frames(column, stored[column], of_episodes)
 
 
-def _samples(root: Path, data: Any, convention: Convention) -> Iterator[tuple[str, str]]:
+def _samples(root: Path, data: Any, convention: Convention, content: Content) -> Iterator[tuple[str, str]]:
     """List each episode and column in which lerobot and ``copy_of`` differ at the sampled steps."""
     episodes = sorted(rows(root).values(), key=lambda row: row["episode_index"])
     places = {round(place) for place in np.linspace(0, len(episodes) - 1, BY_LEROBOT)}
     for place in sorted(places):
         row = episodes[place]
-        copy = copy_of(root, row, (), convention)
+        copy = copy_of(root, row, replace(content, extras=()), convention)
         for step in sampled(row["length"]):
             item = data[row["dataset_from_index"] + step]
             for name, key in convention.motion_keys.items():
                 if not np.array_equal(item[key].numpy(), getattr(copy.episode, name)[step]):
                     yield row[EPISODE_ID], key
-            for view, spec in SCHEMA.views.items():
+            for view, spec in content.cameras.items():
                 # lerobot returns floats in [0, 1], channels first.
                 frame = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
                 if np.abs(frame - copy.frame(view, step)).max() > SAME_LEVELS:
@@ -263,7 +265,7 @@ def forget_sessions() -> None:
 
 
 def check_v21(
-    folder: Path, kept: Mapping[str, Row], convention: Convention, extras: tuple[Extra, ...], validation: float = 0.0
+    folder: Path, kept: Mapping[str, Row], convention: Convention, content: Content, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
@@ -277,8 +279,8 @@ def check_v21(
     for root in sets_v21(folder):
         with readable(root, VERSION_V21):
             _, rows, _ = opened_v21(root)
-            faults = list(_format_v21(root, convention, extras))
-            wrong = list(_wrong_statistics_v21(root, convention, extras))
+            faults = list(_format_v21(root, convention, content))
+            wrong = list(_wrong_statistics_v21(root, convention, content))
         yield from (("format", fault) for fault in faults)
         for what, expected in wrong:
             yield "format", Fault(dataset, None, f"{root.name}: {what}", expected)
@@ -296,11 +298,11 @@ def check_v21(
     yield from in_both_splits(dataset, split_of, kept)
 
 
-def _format_v21(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[Fault]:
+def _format_v21(root: Path, convention: Convention, content: Content) -> Iterator[Fault]:
     """Compare the statements of a set's ``meta/`` with its files and its episodes."""
     info, rows, _ = opened_v21(root)
     tasks = read_lines(root / "meta" / "tasks.jsonl")
-    columns = _as_json(convention.described(extras))
+    columns = _as_json(convention.described(content))
     videos = [key for key, description in columns.items() if description["dtype"] == "video"]
     indices = [row["episode_index"] for row in rows.values()]
     files = [*map(data_path_v21, indices), *(video_path_v21(index, key) for index in indices for key in videos)]
@@ -334,17 +336,17 @@ def _format_v21(root: Path, convention: Convention, extras: tuple[Extra, ...]) -
     yield from unlike(dataset, read, expected, within)
     yield from _wrong_tasks(dataset, tasks, [row["tasks"][0] for row in rows.values()])
     if convention.open_is_one:
-        yield from _wrong_modality(dataset, root, columns, convention)
+        yield from _wrong_modality(dataset, root, columns, convention, content)
     # The videos of a set are alike: only the first of each view is opened here. Reading episodes decodes frames of all.
     for key in videos:
         yield from _wrong_video(dataset, root / video_path_v21(indices[0], key), info["features"][key]["info"])
 
 
-def _wrong_statistics_v21(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[tuple[str, str]]:
+def _wrong_statistics_v21(root: Path, convention: Convention, content: Content) -> Iterator[tuple[str, str]]:
     """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
-    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(extras))
-    views = [convention.name(view.lerobot_key) for view in SCHEMA.views.values()]
+    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(content))
+    views = [convention.name(view.lerobot_key) for view in content.cameras.values()]
     figures: dict[tuple[str, str], list[Any]] = {(view, name): [] for view in views for name in FIGURES}
     with (root / "meta" / "episodes_stats.jsonl").open() as lines:
         for line in lines:
@@ -372,7 +374,7 @@ def _wrong_tasks(dataset: str, tasks: Sequence[Mapping[str, Any]], used: Sequenc
 
 
 def _wrong_modality(
-    dataset: str, root: Path, features: Mapping[str, Mapping[str, Any]], convention: Convention
+    dataset: str, root: Path, features: Mapping[str, Mapping[str, Any]], convention: Convention, content: Content
 ) -> Iterator[Fault]:
     """Compare ``meta/modality.json`` with the columns: parts cover a vector in order, and views are the cameras."""
     modality = json.loads((root / "meta" / "modality.json").read_text())
@@ -387,7 +389,7 @@ def _wrong_modality(
         entries = modality[name].items()
         read = [(part, entry["start"], entry["end"], entry["original_key"]) for part, entry in entries]
         yield from unlike(dataset, {f"{name} of modality.json": read}, {f"{name} of modality.json": wanted})
-    views = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
+    views = {view: convention.name(spec.lerobot_key) for view, spec in content.cameras.items()}
     columns = {
         "video": {"primary_image": views["image"], **views},
         "annotation": {"human.action.task_description": "task_index"},

@@ -3,7 +3,7 @@
 This module is light to import.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -13,9 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, MatrixSpec, PosesSpec
+from pipeline.episode_schema import ALL_VIEWS, MATRICES, MOTION, SCHEMA, Content, MatrixSpec, PosesSpec
 from pipeline.formats.base import StepSizes
-from pipeline.types import Extra
 
 Frames = Literal["video", "images"]
 """``video`` is H.264 encoded from the stored frames; ``images`` are the stored JPEG files, three times as large."""
@@ -34,8 +33,8 @@ ENTRIES = 16
 FILE_MB = 200
 """Approximate largest size of a file of data or video."""
 
-VIDEO_KB = 15.0
-"""Size of one step, both views as video, rounded up from ``benchmarks/disk.py``."""
+VIEW_AS_VIDEO_KB = 7.5
+"""Size of one step of a view of 256 x 256 as video, rounded up from ``benchmarks/disk.py``."""
 
 IN_TEXT = 1.2
 """Size of the base64 columns as a multiple of the PNG files in them."""
@@ -62,9 +61,6 @@ ENCODER_OPTIONS = {
     "threads": "1",
 }
 VIDEO_INFO = {
-    "video.height": SCHEMA.frame.shape[0],
-    "video.width": SCHEMA.frame.shape[1],
-    "video.channels": SCHEMA.frame.shape[2],
     "video.codec": "h264",
     "video.pix_fmt": "yuv420p",
     "video.is_depth_map": False,
@@ -76,7 +72,7 @@ VIDEO_INFO = {
     "video.crf": 20,
     "video.preset": ENCODER_OPTIONS["preset"],
 }
-"""Properties of these files in ``meta/info.json``."""
+"""Properties of these files in ``meta/info.json``, in addition to their size."""
 
 FILES_OF_A_CHUNK = 1000
 """Files in a folder of data or videos; lerobot's own value, which its tools for editing continue to use."""
@@ -106,12 +102,12 @@ def camera_column(view: str, name: str) -> str:
     A matrix is stored row by row in ``meta/provenance.parquet``, a map as PNG in base64 in every frame. Maps are text,
     and no name begins with ``observation``, because lerobot's policies use such columns and all images as inputs.
     """
-    return f"{SCHEMA.views[view].lerobot_camera}.{name}"
+    return f"{ALL_VIEWS[view].lerobot_camera}.{name}"
 
 
-def matrix_columns() -> dict[str, MatrixSpec]:
+def matrix_columns(content: Content) -> dict[str, MatrixSpec]:
     """Return the columns of ``meta/provenance.parquet`` with the matrices of an episode's cameras."""
-    return {camera_column(view, name): getattr(SCHEMA, name) for view in SCHEMA.views for name in MATRICES}
+    return {camera_column(view, name): getattr(SCHEMA, name) for view in content.views for name in MATRICES}
 
 
 def _flat(spec: PosesSpec) -> dict[str, Any]:
@@ -170,26 +166,26 @@ class Convention:
         """Return the name of a column of v3.0."""
         return self.names.get(column, column)
 
-    def step_kb(self, sizes: StepSizes) -> float:
+    def step_kb(self, sizes: StepSizes, content: Content) -> float:
         """Estimate the size of one step of an episode, in KB."""
-        views = len(SCHEMA.views)
-        frames_kb = VIDEO_KB if self.frames == "video" else views * sizes.frame_kb + sizes.motion_kb
+        views = len(content.views)
+        video_kb = VIEW_AS_VIDEO_KB * views * content.area
+        frames_kb = video_kb if self.frames == "video" else views * sizes.frame_kb + sizes.motion_kb
         return frames_kb + IN_TEXT * views * sizes.maps_kb + sizes.poses_kb
 
-    def columns(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
+    def columns(self, content: Content) -> dict[str, dict[str, Any]]:
         """Describe the columns of every frame, without the encoding of videos."""
-        frame = {"dtype": "video", "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
+        frame = {"dtype": "video", "shape": content.frame_shape, "names": list(SCHEMA.frame.names)}
         if self.frames == "images":
             frame["dtype"] = "image"
         text, number = ({"dtype": dtype, "shape": (1,), "names": None} for dtype in ("string", "int64"))
-        columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
+        columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in content.cameras.values()}
         for name, key in self.motion_keys.items():
             spec = getattr(SCHEMA, name)
             columns[key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
         columns[EPISODE_ID] = dict(text)
-        maps = [name for name in MAPS if name in extras]
-        columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in maps}
-        if "object_poses" in extras:
+        columns |= {camera_column(view, name): dict(text) for view in content.views for name in content.maps}
+        if "object_poses" in content.extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
         if self.language:
             columns[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
@@ -197,11 +193,12 @@ class Convention:
         columns |= {name: dict(number) for name in COUNTERS}
         return {self.name(column): description for column, description in columns.items()}
 
-    def described(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
+    def described(self, content: Content) -> dict[str, dict[str, Any]]:
         """Describe the columns as ``meta/info.json`` does, videos with the properties of their encoding."""
+        size = dict(zip(("video.height", "video.width", "video.channels"), content.frame_shape, strict=True))
         columns = {}
-        for name, description in self.columns(extras).items():
-            encoding = {"info": VIDEO_INFO} if description["dtype"] == "video" else {}
+        for name, description in self.columns(content).items():
+            encoding = {"info": size | VIDEO_INFO} if description["dtype"] == "video" else {}
             columns[name] = {**description, **encoding}
         return columns
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
+from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.lerobot.columns import (
@@ -32,7 +32,7 @@ from pipeline.formats.lerobot.columns import (
 )
 from pipeline.formats.read_back import Copy, Statistics, sampled
 from pipeline.formats.stated_statistics import QUANTILES
-from pipeline.types import Episode, Extra, Frame, Geometry
+from pipeline.types import Episode, Frame, Geometry
 
 UNREADABLE = (
     AssertionError,
@@ -55,15 +55,15 @@ NUMBERS = ("float32", "int64")
 """Types of the columns that have statistics, in addition to frames."""
 
 
-def read(root: Path, episode_id: str, extras: tuple[Extra, ...], convention: Convention) -> Copy | None:
-    """Read an episode with these extras; ``None`` when the dataset does not have it.
+def read(root: Path, episode_id: str, content: Content, convention: Convention) -> Copy | None:
+    """Read an episode with this content; ``None`` when the dataset does not have it.
 
     Raises:
         PipelineError: when the episode cannot be read.
     """
     with readable(root):
         row = rows(root).get(episode_id)
-        return None if row is None else copy_of(root, row, extras, convention)
+        return None if row is None else copy_of(root, row, content, convention)
 
 
 @contextmanager
@@ -108,7 +108,7 @@ def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
     return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
 
 
-def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...], convention: Convention) -> Copy:
+def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Convention) -> Copy:
     """Read an episode, given its row of ``rows``."""
     index, steps = row["episode_index"], row["length"]
     info, _ = _opened(edition(root / "meta" / "info.json"))
@@ -120,7 +120,7 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...], conve
         stated = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
         raise ValueError(f"episode {index} of {steps} steps, {instructions[0]!r}, {stated}")
     videos = {}
-    for view, spec in SCHEMA.views.items():
+    for view, spec in content.cameras.items():
         key = spec.lerobot_key
         if info["features"][key]["dtype"] == "video":
             chunk, number = _file(row, f"videos/{key}")
@@ -131,7 +131,7 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...], conve
             videos[view] = path, first_s
     return Copy(
         dataset="lerobot",
-        episode=episode(table, row, instructions[0], extras, convention),
+        episode=episode(table, row, instructions[0], content, convention),
         instructions=instructions,
         decoded=decoded(table["timestamp"].to_pylist(), videos),
         marks={name: table[name].to_numpy() for name in MARKS},
@@ -141,7 +141,7 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...], conve
         statistics=Statistics(
             stored=_statistics(root, row),
             numbers={name: matrix(table, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
-            views={view: spec.lerobot_key for view, spec in SCHEMA.views.items()},
+            views={view: spec.lerobot_key for view, spec in content.cameras.items()},
             quantiles=QUANTILES,
         ),
     )
@@ -193,14 +193,14 @@ def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
 
 
 def episode(
-    table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...], convention: Convention
+    table: pa.Table, row: Mapping[str, Any], instruction: str, content: Content, convention: Convention
 ) -> Episode:
     """Return an episode, given v3.0's columns of its steps and its row of ``meta/provenance.parquet``.
 
     The episode has frames only where they are stored as image files.
     """
     frames = {}
-    for view, spec in SCHEMA.views.items():
+    for view, spec in content.cameras.items():
         if spec.lerobot_key in table.column_names:
             frames[view] = [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
     motion = {name: matrix(table, key) for name, key in convention.motion_keys.items()}
@@ -213,9 +213,9 @@ def episode(
         action_absolute=motion["action_absolute"],
         instruction=instruction,
         provenance=row,
-        geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},
-        object_poses=_object_poses(table) if "object_poses" in extras else None,
-        instances=json.loads(row[INSTANCES]) if named(extras) else (),
+        geometry={view: _geometry(table, row, view, content) for view in content.views},
+        object_poses=_object_poses(table) if "object_poses" in content.extras else None,
+        instances=json.loads(row[INSTANCES]) if content.has_names else (),
     )
 
 
@@ -241,12 +241,12 @@ def _object_poses(table: pa.Table) -> NDArray[np.float32]:
     return matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
 
 
-def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
+def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, content: Content) -> Geometry:
     matrices = {}
     for name in MATRICES:
         numbers = np.array(row[camera_column(view, name)], np.float32)
         matrices[name] = numbers.reshape(getattr(SCHEMA, name).shape)
-    texts = {name: table[camera_column(view, name)].to_pylist() for name in MAPS if name in extras}
+    texts = {name: table[camera_column(view, name)].to_pylist() for name in content.maps}
     maps = {name: list(map(base64.b64decode, files)) for name, files in texts.items()}
     return Geometry(**matrices, maps=maps)
 
@@ -290,13 +290,13 @@ def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
 
 
 _VIDEOS: dict[Edition, av.container.InputContainer] = {}
-"""Open videos, one of each view."""
+"""Open videos, as many as an episode may have views."""
 
 
 def _video(file: Edition) -> av.container.InputContainer:
     """Open a video and keep it open for a while, because a caller probably asks for its next frames."""
     if file not in _VIDEOS:
-        while len(_VIDEOS) >= len(SCHEMA.views):
+        while len(_VIDEOS) >= len(ALL_VIEWS):
             _VIDEOS.pop(next(iter(_VIDEOS))).close()
         _VIDEOS[file] = av.open(str(file.path))
         _VIDEOS[file].streams.video[0].thread_count = 1  # Starting more takes longer than a few frames.
@@ -320,8 +320,8 @@ def open_all_v21(folder: Path) -> None:
             opened_v21(root)
 
 
-def read_v21(folder: Path, episode_id: str, convention: Convention, extras: tuple[Extra, ...]) -> Copy | None:
-    """Read an episode with these extras, under v3.0's names and with LIBERO's gripper; ``None`` when no set has it.
+def read_v21(folder: Path, episode_id: str, convention: Convention, content: Content) -> Copy | None:
+    """Read an episode with this content, under v3.0's names and with LIBERO's gripper; ``None`` when no set has it.
 
     Raises:
         PipelineError: when the episode cannot be read.
@@ -330,7 +330,7 @@ def read_v21(folder: Path, episode_id: str, convention: Convention, extras: tupl
         with readable(root, VERSION_V21):
             info, rows, tasks = opened_v21(root)
             if episode_id in rows:
-                return _copy_v21(root, info, rows[episode_id], tasks, convention, extras)
+                return _copy_v21(root, info, rows[episode_id], tasks, convention, content)
     return None
 
 
@@ -340,7 +340,7 @@ def _copy_v21(
     row: Mapping[str, Any],
     tasks: Mapping[int, str],
     convention: Convention,
-    extras: tuple[Extra, ...],
+    content: Content,
 ) -> Copy:
     index = row["episode_index"]
     stored = pq.read_table(root / data_path_v21(index))
@@ -350,10 +350,10 @@ def _copy_v21(
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
     v30_names = {name: v30_name for v30_name, name in convention.names.items()}
     table = stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
-    made = episode(table, row, instructions[0], extras, convention)
+    made = episode(table, row, instructions[0], content, convention)
     if convention.open_is_one:
         made = replace(made, action=_libero_gripper(made.action), action_absolute=_libero_gripper(made.action_absolute))
-    keys = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
+    keys = {view: convention.name(spec.lerobot_key) for view, spec in content.cameras.items()}
     videos = {
         view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"
     }

@@ -33,7 +33,7 @@ import pyarrow.parquet as pq
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MATRICES, SCHEMA, check, named, provenance_of
+from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, STANDARD, Content, check
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, listed, of_levels, open_is_one
@@ -62,7 +62,7 @@ from pipeline.formats.lerobot.columns import (
     video_path_v21,
 )
 from pipeline.images.jpeg import decode
-from pipeline.types import Episode, Extra, Frame
+from pipeline.types import Episode, Frame
 
 PROVENANCE, LEVELS = "provenance.parquet", "levels.json"
 """Files in a piece's folder, in both versions: a row for each episode, and counts of levels."""
@@ -105,11 +105,11 @@ _LANGUAGE_TYPE = datasets.List(
 class Video:
     """A file that is written frame by frame; it is complete when the block ends."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, content: Content = STANDARD) -> None:
         self.frames = 0
         self._file = av.open(str(path), "w")
         self._stream = self._file.add_stream(ENCODER, SCHEMA.fps_hz, options=ENCODER_OPTIONS)
-        self._stream.height, self._stream.width, _ = SCHEMA.frame.shape
+        self._stream.height, self._stream.width, _ = content.frame_shape
         self._stream.pix_fmt = VIDEO_INFO["video.pix_fmt"]
 
     def __enter__(self) -> Self:
@@ -147,7 +147,7 @@ def planes(pixels: Frame) -> NDArray[np.uint8]:
 
 
 def _load_each(
-    piece: Piece, load: Load, convention: Convention, extras: Sequence[Extra]
+    piece: Piece, load: Load, convention: Convention, content: Content
 ) -> Iterator[tuple[int, int, Episode, Numbers]]:
     """Load and check each episode of a piece.
 
@@ -160,7 +160,7 @@ def _load_each(
     first_step = piece.first_step
     for index, episode_id in enumerate(piece.ids, piece.first_episode):
         episode = load(episode_id)
-        check(episode, extras)
+        check(episode, content)
         if convention.open_is_one:
             episode = replace(
                 episode,
@@ -227,9 +227,9 @@ def _step_columns(episode: Episode, found: Numbers, frames: Frames) -> dict[str,
     images = {}
     if frames == "images":
         image_type = datasets.Image().pa_type
-        for view, spec in SCHEMA.views.items():
-            cells = [{"bytes": packed, "path": None} for packed in episode.frames[view]]
-            images[spec.lerobot_key] = pa.array(cells, image_type)
+        for view, files in episode.frames.items():
+            cells = [{"bytes": packed, "path": None} for packed in files]
+            images[ALL_VIEWS[view].lerobot_key] = pa.array(cells, image_type)
     stored = {}
     for name, values in found.items():
         if values.ndim == 1:
@@ -266,15 +266,18 @@ def _episode_statistics(found: Numbers, shown: Mapping[str, Counts]) -> dict[str
     for name, values in found.items():
         rows = values.reshape(len(values), -1)
         of_numbers[name] = describe(rows, QUANTILES) | {"count": np.array([len(values)])}
-    return of_numbers | {SCHEMA.views[view].lerobot_key: of_levels(counts) for view, counts in shown.items()}
+    steps = len(found["timestamp"])
+    return of_numbers | {ALL_VIEWS[view].lerobot_key: of_levels(counts, steps) for view, counts in shown.items()}
 
 
-def _provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
+def _provenance_schema(content: Content) -> pa.Schema:
     """Return the schema of ``meta/provenance.parquet``, which has a row for each episode, and which lerobot ignores."""
     stored = {"episode_index": pa.int64()}
-    stored |= {name: pa.type_for_alias(dtype) for name, dtype in provenance_of(extras).items()}
-    stored |= {name: pa.list_(pa.float32(), spec.shape[0] * spec.shape[1]) for name, spec in matrix_columns().items()}
-    if named(extras):
+    stored |= {name: pa.type_for_alias(dtype) for name, dtype in content.provenance.items()}
+    stored |= {
+        name: pa.list_(pa.float32(), spec.shape[0] * spec.shape[1]) for name, spec in matrix_columns(content).items()
+    }
+    if content.has_names:
         stored[INSTANCES] = pa.string()
     return pa.schema(stored)
 
@@ -292,31 +295,29 @@ def _provenance_row(episode: Episode, index: int) -> dict[str, Any]:
 # Files of both versions.
 
 
-def _write_summary(
-    path: Path, made: Sequence[tuple[dict[str, Any], Mapping[str, Counts]]], extras: Sequence[Extra]
-) -> None:
+def _write_summary(path: Path, made: Sequence[tuple[dict[str, Any], Mapping[str, Counts]]], content: Content) -> None:
     """Write ``PROVENANCE`` and ``LEVELS`` of a piece, from the provenance and the levels of each episode."""
     rows, counts_of_episodes = zip(*made, strict=True)
-    pq.write_table(pa.Table.from_pylist(list(rows), schema=_provenance_schema(extras)), path / PROVENANCE)
+    pq.write_table(pa.Table.from_pylist(list(rows), schema=_provenance_schema(content)), path / PROVENANCE)
     levels = {}
-    for view in SCHEMA.views:
+    for view in content.views:
         total = sum(counts[view] for counts in counts_of_episodes)
         levels[view] = total.tolist()
     (path / LEVELS).write_text(json.dumps(levels))
 
 
 def _write_common(
-    work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, extras: Sequence[Extra]
+    work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, content: Content
 ) -> dict[str, int]:
     """Write provenance and exact statistics of a dataset whose data files exist, and return its numbered tasks."""
     tables = [pq.read_table(work / piece.path / PROVENANCE) for piece in pieces]
     pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
-    columns = convention.columns(extras)
+    columns = convention.columns(content)
     levels_of_pieces = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
     figures = {}
-    for view, spec in SCHEMA.views.items():
+    for view, spec in content.cameras.items():
         total = np.sum([levels[view] for levels in levels_of_pieces], axis=0)
-        figures[convention.name(spec.lerobot_key)] = of_levels(total)
+        figures[convention.name(spec.lerobot_key)] = of_levels(total, pieces[-1].first_step + pieces[-1].steps)
     for name, description in columns.items():
         if description["dtype"] in ("float32", "int64"):
             figures[name] = _exact(root, name, description["shape"][0])
@@ -349,7 +350,7 @@ def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
     return figures | {"count": np.array([len(values)])}
 
 
-def _write_modality(root: Path, convention: Convention) -> None:
+def _write_modality(root: Path, convention: Convention, content: Content) -> None:
     """Write ``meta/modality.json``, by which GR00T and starVLA find their inputs.
 
     Entries and names are those of ``examples/simBenchmarks/LIBERO/train_files/modality.json`` in starVLA/starVLA at
@@ -362,15 +363,15 @@ def _write_modality(root: Path, convention: Convention) -> None:
         return {name: {"start": k, "end": k + 1, "original_key": column} for k, name in enumerate(names)}
 
     pose = ("x", "y", "z", "roll", "pitch", "yaw")
-    views = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
+    views = {view: convention.name(spec.lerobot_key) for view, spec in content.cameras.items()}
     videos = {"primary_image": views["image"], **views}
-    content = {
+    modality = {
         "state": entries(convention.name(SCHEMA.state.lerobot_key), *pose, "pad", "gripper"),
         "action": entries(convention.name(SCHEMA.action.lerobot_key), *pose, "gripper"),
         "video": {name: {"original_key": column} for name, column in videos.items()},
         "annotation": {"human.action.task_description": {"original_key": "task_index"}},
     }
-    _write_json(root / "meta" / "modality.json", content)
+    _write_json(root / "meta" / "modality.json", modality)
 
 
 def _link(made: Path, place: Path) -> None:
@@ -396,7 +397,7 @@ def file_path(kind: str, number: int, suffix: str) -> str:
     return f"{kind}/{PLACE.format(chunk_index=chunk, file_index=file)}{suffix}"
 
 
-def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, extras: tuple[Extra, ...]) -> None:
+def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, content: Content) -> None:
     """Write the files of a piece's episodes into a new folder, with one episode at a time in memory.
 
     The bytes, including those of videos, depend only on the episodes, their order and the encoder's version.
@@ -407,13 +408,13 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, ex
     path.mkdir()
     rows, made = [], []
     with ExitStack() as opened:
-        data = opened.enter_context(pq.ParquetWriter(path / DATA, _data_schema(convention.columns(extras))))
+        data = opened.enter_context(pq.ParquetWriter(path / DATA, _data_schema(convention.columns(content))))
         videos = {}
         if convention.frames == "video":
-            for view in SCHEMA.views:
-                videos[view] = opened.enter_context(Video(path / f"{view}.mp4"))
-        for index, first_step, episode, numbers in _load_each(piece, load, convention, extras):
-            levels = {view: _append_frames(episode, view, videos.get(view)) for view in SCHEMA.views}
+            for view in content.views:
+                videos[view] = opened.enter_context(Video(path / f"{view}.mp4", content))
+        for index, first_step, episode, numbers in _load_each(piece, load, convention, content):
+            levels = {view: _append_frames(episode, view, videos.get(view)) for view in content.views}
             columns = _step_columns(episode, numbers, convention.frames)
             if convention.language:
                 columns |= _language_column(episode, piece.split == "train")
@@ -427,24 +428,24 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, ex
             rows.append(row)
             made.append((_provenance_row(episode, index), levels))
     pq.write_table(pa.Table.from_pylist(rows), path / EPISODES)
-    _write_summary(path, made, extras)
+    _write_summary(path, made, content)
 
 
-def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, extras: tuple[Extra, ...]) -> None:
+def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, content: Content) -> None:
     """Link the files of all pieces to their places below ``root``, and write the files about all episodes."""
     for piece in pieces:
         places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
-        places |= {f"{view}.mp4": (f"videos/{spec.lerobot_key}", ".mp4") for view, spec in SCHEMA.views.items()}
+        places |= {f"{view}.mp4": (f"videos/{spec.lerobot_key}", ".mp4") for view, spec in content.cameras.items()}
         for name, (kind, suffix) in places.items():
             made = work / piece.path / name
             if made.exists():
                 _link(made, root / file_path(kind, piece.number, suffix))
-    tasks = _write_common(work, root, pieces, convention, extras)
+    tasks = _write_common(work, root, pieces, convention, content)
     # lerobot finds a task by the table's index.
     numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
     table = pa.table(numbered).replace_schema_metadata({"pandas": INDEX})
     pq.write_table(table, root / "meta" / "tasks.parquet")
-    _write_modality(root, convention)
+    _write_modality(root, convention, content)
     splits: dict[str, tuple[int, int]] = {}  # Ranges of episodes, in the order of the pieces.
     for piece in pieces:
         first, _ = splits.get(piece.split, (piece.first_episode, 0))
@@ -458,7 +459,7 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
         "splits": {name: f"{first}:{end}" for name, (first, end) in splits.items()},
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if convention.frames == "video" else None,
-        "features": convention.described(extras),
+        "features": convention.described(content),
     }
     _write_json(root / "meta" / "info.json", info)
 
@@ -479,12 +480,13 @@ def _episode_row(episode: Episode, piece: Piece, index: int, first_step: int, fr
         "meta/episodes/file_index": file,
     }
     before = first_step - piece.first_step
-    for view in SCHEMA.views.values() if frames == "video" else ():
+    for view in episode.frames if frames == "video" else ():
+        key = ALL_VIEWS[view].lerobot_key
         row |= {
-            f"videos/{view.lerobot_key}/chunk_index": chunk,
-            f"videos/{view.lerobot_key}/file_index": file,
-            f"videos/{view.lerobot_key}/from_timestamp": before / SCHEMA.fps_hz,
-            f"videos/{view.lerobot_key}/to_timestamp": (before + steps) / SCHEMA.fps_hz,
+            f"videos/{key}/chunk_index": chunk,
+            f"videos/{key}/file_index": file,
+            f"videos/{key}/from_timestamp": before / SCHEMA.fps_hz,
+            f"videos/{key}/to_timestamp": (before + steps) / SCHEMA.fps_hz,
         }
     return row
 
@@ -492,7 +494,7 @@ def _episode_row(episode: Episode, piece: Piece, index: int, first_step: int, fr
 # Version 2.1.
 
 
-def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention, extras: tuple[Extra, ...]) -> None:
+def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention, content: Content) -> None:
     """Write the files of a piece's episodes into a new folder, under the paths of their set.
 
     The bytes, including those of videos, depend only on the episodes, their order and the encoder's version.
@@ -504,8 +506,8 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
     made = []
     with ExitStack() as opened:
         episodes, stats = (opened.enter_context((path / name).open("w")) for name in LINES_V21)
-        for index, _, episode, numbers in _load_each(piece, load, convention, extras):
-            levels = _write_episode_v21(path, index, episode, numbers, convention, extras)
+        for index, _, episode, numbers in _load_each(piece, load, convention, content):
+            levels = _write_episode_v21(path, index, episode, numbers, convention, content)
             figures = {}
             for name, all_figures in _episode_statistics(numbers, levels).items():
                 figures[convention.name(name)] = listed({figure: all_figures[figure] for figure in STATISTICS_V21})
@@ -513,7 +515,7 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
             episodes.write(json.dumps(row | {"episode_id": episode.episode_id}) + "\n")
             stats.write(json.dumps({"episode_index": index, "stats": figures}) + "\n")
             made.append((_provenance_row(episode, index), levels))
-    _write_summary(path, made, extras)
+    _write_summary(path, made, content)
 
 
 def _write_episode_v21(
@@ -522,21 +524,21 @@ def _write_episode_v21(
     episode: Episode,
     numbers: Numbers,
     convention: Convention,
-    extras: tuple[Extra, ...],
+    content: Content,
 ) -> dict[str, Counts]:
     """Write the files of one episode and return the counts of levels of its views."""
     levels = {}
-    for view, spec in SCHEMA.views.items():
+    for view, spec in content.cameras.items():
         if convention.frames == "video":
             file = path / video_path_v21(index, convention.name(spec.lerobot_key))
             file.parent.mkdir(parents=True, exist_ok=True)
-            with Video(file) as video:
+            with Video(file, content) as video:
                 levels[view] = _append_frames(episode, view, video)
         else:
             levels[view] = _append_frames(episode, view, None)
     v30_columns = _step_columns(episode, numbers, convention.frames)
     columns = {convention.name(name): values for name, values in v30_columns.items()}
-    schema = _data_schema_v21(convention, extras)
+    schema = _data_schema_v21(convention, content)
     file = path / data_path_v21(index)
     file.parent.mkdir(parents=True, exist_ok=True)
     table = pa.table({name: columns[name] for name in schema.names})
@@ -544,16 +546,14 @@ def _write_episode_v21(
     return levels
 
 
-def _data_schema_v21(convention: Convention, extras: tuple[Extra, ...]) -> pa.Schema:
-    schema = _data_schema(convention.columns(extras))
+def _data_schema_v21(convention: Convention, content: Content) -> pa.Schema:
+    schema = _data_schema(convention.columns(content))
     # datasets 4 names a list differently from the clients' versions 2 and 3, but also reads their name.
     metadata = schema.metadata or {}
     return schema.with_metadata({name: value.replace(b'"List"', b'"Sequence"') for name, value in metadata.items()})
 
 
-def finish_v21(
-    work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, extras: tuple[Extra, ...]
-) -> None:
+def finish_v21(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, content: Content) -> None:
     """Link the files of a set's pieces to their places below ``root``, and write the files about all episodes."""
     (root / "meta").mkdir(parents=True)
     for piece in pieces:
@@ -562,22 +562,22 @@ def finish_v21(
     for name in LINES_V21:
         texts = [(work / piece.path / name).read_text() for piece in pieces]
         (root / "meta" / name).write_text("".join(texts))
-    tasks = _write_common(work, root, pieces, convention, extras)
+    tasks = _write_common(work, root, pieces, convention, content)
     rows = [{"task_index": number, "task": task} for task, number in tasks.items()]
     (root / "meta" / "tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     if convention.open_is_one:  # The readers of modality.json expect this gripper.
-        _write_modality(root, convention)
+        _write_modality(root, convention, content)
     totals = _totals("v2.1", pieces[-1], len(tasks), convention)
     episodes, videos = totals["total_episodes"], convention.frames == "video"
     info = {
         **totals,
-        "total_videos": episodes * len(SCHEMA.views) if videos else 0,
+        "total_videos": episodes * len(content.views) if videos else 0,
         "total_chunks": -(-episodes // FILES_OF_A_CHUNK),
         "chunks_size": FILES_OF_A_CHUNK,
         "fps": SCHEMA.fps_hz,
         "splits": {"train": f"0:{episodes}"},
         "data_path": DATA_PATH_V21,
         "video_path": VIDEO_PATH_V21 if videos else None,
-        "features": convention.described(extras),
+        "features": convention.described(content),
     }
     _write_json(root / "meta" / "info.json", info)

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SIZE_PX
 from pipeline.rendering.software.mujoco_3_2_7.passes import REFLECTING_SQUARE, WIDEST_MAP_DEG
 from pipeline.rendering.software.samples import Projection
 from pipeline.types import Floats
@@ -74,13 +74,15 @@ class Culling:
     Args:
         model: the model.
         hidden_groups: groups of geoms that are not rendered.
+        size_px: height and width of the frames.
 
     Attributes:
         shown: (ngeom,) geoms that are not in a hidden group.
     """
 
-    def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int]):
-        self._model, self.shown = model, ~np.isin(model.geom_group, list(hidden_groups))
+    def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int], size_px: int = SIZE_PX):
+        self._model, self._size_px = model, size_px
+        self.shown = ~np.isin(model.geom_group, list(hidden_groups))
         self._planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         bounds = model.geom_aabb.reshape(-1, 2, 3).copy()
         bounds[self._planes, 0], bounds[self._planes, 1] = 0, model.geom_size[self._planes] * [1, 1, 0]
@@ -91,7 +93,7 @@ class Culling:
 
     def picture(self, data: mujoco.MjData, camera: str) -> Picture:
         """Choose the geoms, lights and sites to render for the data's state; positions must be up to date."""
-        view, clear = _View(self._model, data, camera), self._see_through()
+        view, clear = _View(self._model, data, camera, self._size_px), self._see_through()
         mirror, certain = self._mirror(data, view, clear)
         if not certain:
             return self.everything()
@@ -224,13 +226,13 @@ def _in_cone(middles_m: Floats, radii_m: Floats, tip_m: Floats, axis: Floats, an
 class _View:
     """Pyramid that a camera sees, in the camera's frame: it looks along -z, with y up."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str):
-        number, (height, width, _) = model.camera(camera).id, SCHEMA.frame.shape
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, size_px: int):
+        number = model.camera(camera).id
         self.position_m, self._axes = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
         tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
         # Tangents of half the angles of view, to the side and up.
-        self._tangents = tangent * width / height, tangent
-        self._size_px = width, height
+        self._tangents = tangent, tangent
+        self._size_px = size_px, size_px
         self._depths_m = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent
 
     def projection(self) -> Projection:

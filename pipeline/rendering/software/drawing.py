@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes.base import FIELDS
+from pipeline.episode_schema import SIZE_PX
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.software.culling import Culling, Picture
 from pipeline.rendering.software.mujoco_3_2_7 import context as private
@@ -96,10 +97,10 @@ class SoftwareDrawing(PlainDrawing):
 
     chooses_faces = True
 
-    def __init__(self, model: mujoco.MjModel):
+    def __init__(self, model: mujoco.MjModel, size_px: int = SIZE_PX):
         # Create the context for the common parts of all scenes, and then switch it to this model.
         bare = private.bare(model)
-        super().__init__(bare)
+        super().__init__(bare, size_px)
         with ExitStack() as undo:
             undo.callback(self.close)
             self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
@@ -133,7 +134,8 @@ class SoftwareDrawing(PlainDrawing):
         private.adopt_textures(self._context, model, self._model)
         private.adopt_size(self._context, model)
         self._model = model
-        self._culling = Culling(model, np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist())
+        hidden_groups = np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist()
+        self._culling = Culling(model, hidden_groups, self.size_px)
         shown = self._culling.shown
         rendered = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
         self._meshes = Meshes(self._context, model, rendered, self._meshes)

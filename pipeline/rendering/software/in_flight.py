@@ -9,7 +9,6 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import calls, check
 from pipeline.types import Frame
@@ -27,10 +26,11 @@ class PixelBuffers:
     Args:
         context: MuJoCo's context.
         count: number of buffers.
+        size_px: height and width of the frames.
     """
 
-    def __init__(self, context: mujoco.MjrContext, count: int):
-        self._context, (self._height, self._width, _) = context, SCHEMA.frame.shape
+    def __init__(self, context: mujoco.MjrContext, count: int, size_px: int):
+        self._context, self._height, self._width = context, size_px, size_px
         opengl = calls()
         self._buffers: list[int] = np.atleast_1d(opengl.glGenBuffers(count)).tolist()
         for buffer in self._buffers:
@@ -96,7 +96,7 @@ class InFlightDrawing(PlainDrawing):
     @cached_property
     def _buffers(self) -> PixelBuffers:
         """Create the buffers in the current context."""
-        return PixelBuffers(self._context, BUFFERS)
+        return PixelBuffers(self._context, BUFFERS, self.size_px)
 
     def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
         """Start to render a frame; see ``PlainDrawing``. Up to ``BUFFERS`` frames are in flight at a time."""
