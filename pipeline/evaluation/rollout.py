@@ -134,6 +134,21 @@ class Evaluation:
         row = self.files.row(self.episode(task))
         return row if row is not None and _record(row).matches(self.basis(task)) else None
 
+    def test_results(self) -> list[EpisodeResult]:
+        """Read the up-to-date results on test tasks of this policy under these settings, of any selection.
+
+        Raises:
+            PipelineError: if a file is not a result of this version.
+        """
+        results: list[EpisodeResult] = []
+        for row in self.files.rows():
+            if row.source != "libero_plus":
+                continue
+            task, *_ = row.trial
+            if row.episode == self.episode(task) and _record(row).matches(self.basis(task)):
+                results.append(row)
+        return results
+
     def check(self, tasks: Iterable[EvaluationTask]) -> None:
         """Reject a folder that this evaluation must not write into.
 
