@@ -62,8 +62,16 @@ TRAINED_ON = "Configuration of the policy's training data; held-out perturbation
     initial_states="--initial-states",
     look_every="--look-every",
     actions="--actions",
+    own_step_limit="--own-step-limit",
 )
 @model_options(PolicyConfig, label="--label", timeout_s="--timeout")
+@click.option(
+    "--demos",
+    metavar="DIR",
+    type=PATH,
+    help="Folder of demonstrations, <suite>/<task>_demo.hdf5, for --initial-states demonstration, --replay and held-out "
+    "perturbations of own tasks (default: the starter set).",
+)
 @click.option("--assets", metavar="DIR", type=PATH, help="Folder of the unpacked asset archive of LIBERO-Plus.")
 @click.option(
     "--videos",
@@ -85,7 +93,7 @@ def evaluate(
     workers: int | None,
     **options: Any,
 ) -> None:
-    """Run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out perturbations of the axes.
+    """Run a policy on LIBERO's tasks or your own, on LIBERO-Plus's test tasks or on held-out perturbations.
 
     The command writes a file for each episode into DIR, and summary.json with success rates and their 95 % intervals.
     The policy is a model server of vla-eval, which you start first, or a checkpoint of lerobot. A stopped evaluation

@@ -297,7 +297,7 @@ def _lerobot_episodes(file: Path) -> list[_Episode]:
             f"all numbers of tasks are below {LIBERO_TASKS}, so the tasks may be LIBERO's own",
             where=f"{file} per_task",
             expected="results of lerobot's environment libero_plus with further tasks",
-            remedy="evaluate all tasks of a suite; results of this project's environment are in the folder of --env.out",
+            remedy="evaluate all tasks of a suite; for this project's environment, name the folder of --env.out",
         )
     episodes = []
     for task in content.per_task:

@@ -1,7 +1,6 @@
 """Content of a report of evaluations, as JSON: rates, the paper's table, comparisons, failures."""
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain, combinations
 from typing import Any
 

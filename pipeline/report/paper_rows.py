@@ -149,8 +149,9 @@ def markdown(table: Mapping[str, Any]) -> str:
         lines += _notes(row)
     protocol = table["protocol"]
     lines.append(
-        f"- Published ({table['source']}): {protocol['tasks_run']:,} tasks; {protocol['trials']} trial per task; prompt "
-        f"{protocol['prompt']}; step limits {protocol['step_limits']}; the mean of seven is not in the paper."
+        f"- Published ({table['source']}): {protocol['tasks_run']:,} tasks; {protocol['trials']} trial per task; "
+        f"prompt {protocol['prompt']}; step limits {protocol['step_limits']}; the mean of seven is computed from the "
+        "columns."
     )
     return "\n".join(lines) + "\n"
 
