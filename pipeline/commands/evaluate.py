@@ -69,8 +69,8 @@ TRAINED_ON = "Configuration of the policy's training data; held-out perturbation
     "--demos",
     metavar="DIR",
     type=PATH,
-    help="Folder of demonstrations, <suite>/<task>_demo.hdf5, for --initial-states demonstration, --replay and held-out "
-    "perturbations of own tasks (default: the starter set).",
+    help="Folder of demonstrations, <suite>/<task>_demo.hdf5, for --initial-states demonstration, --replay and "
+    "held-out perturbations (default: the starter set).",
 )
 @click.option("--assets", metavar="DIR", type=PATH, help="Folder of the unpacked asset archive of LIBERO-Plus.")
 @click.option(

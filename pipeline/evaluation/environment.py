@@ -79,8 +79,8 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
                 raise PipelineError(
                     f"LIBERO has no step limit for your suite {suite}",
                     where="own_step_limit",
-                    expected="a number of control steps, 20 per second; LIBERO's limits are 3 to 14 % above its longest "
-                    "demonstration",
+                    expected="a number of control steps, 20 per second; LIBERO's limits are 3 to 14 % above its "
+                    "longest demonstrations",
                     remedy="add --own-step-limit N",
                 )
             return self.own_step_limit

@@ -196,8 +196,8 @@ def _check_own_tasks(wanted: Sequence[EvaluationTask], settings: EpisodeSettings
         raise PipelineError(
             f"LIBERO has no step limit for your suite {task.suite}",
             where="own_step_limit",
-            expected=f"more than the {longest} steps of the longest demonstration of {task.name}; LIBERO's limits are 3 "
-            "to 14 % above its longest demonstration",
+            expected=f"more than the {longest} steps of the longest demonstration of {task.name}; LIBERO's limits are "
+            "3 to 14 % above its longest demonstrations",
             remedy="add --own-step-limit N",
         )
     settings.step_limit(task.suite)

@@ -98,8 +98,8 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
                 expected="1",
                 remedy="set --eval.batch_size to run several episodes at the same time",
             )
-        named = ("prompt", "seed", "step_limits", "actions", "initial_states", "own_step_limit", "demos")
-        given = {name: getattr(self, name) for name in named}
+        settings_named = ("prompt", "seed", "step_limits", "actions", "initial_states", "own_step_limit", "demos")
+        given = {name: getattr(self, name) for name in settings_named}
         settings = EpisodeSettings.model_validate({**given, "runner": "lerobot-eval"})
         archive = None if self.assets is None else Path(self.assets)
         evaluation = self._evaluation(settings, archive)

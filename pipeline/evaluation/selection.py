@@ -51,9 +51,9 @@ class Selection(Frozen, use_attribute_docstrings=True):
     """Selection of tasks; a field that is left out does not restrict it."""
 
     source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
-    """tasks without perturbation; LIBERO-Plus's test tasks; held-out perturbations on this project's axes (``own``); LIBERO's tasks
-    asked for another object of their scene (``goals``); for every two axes LIBERO's task, a held-out perturbation on
-    either, and both together, on the same initial states (``pairs``)"""
+    """LIBERO's tasks and the user's own; LIBERO-Plus's test tasks; held-out perturbations on this project's axes
+    (``own``); LIBERO's tasks asked for another object of their scene (``goals``); for every two axes the task, a
+    held-out perturbation on either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
     """list of tasks that ``analyze construct`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES

@@ -45,9 +45,9 @@ class EvaluationTask:
     """Identification of one task in one scene; everything else about the task is looked up by these fields.
 
     Attributes:
-        source: ``libero`` for tasks without perturbation, also the user's own, ``libero_plus``, ``own`` for held-out
-            perturbations on one or more of this project's axes, or ``goals`` for a LIBERO task that asks for another
-            object of its scene.
+        source: ``libero`` for a task without perturbation, also a user's own. ``libero_plus`` for a test task. ``own``
+            for held-out perturbations on one or more of this project's axes. ``goals`` for a LIBERO task that asks for
+            another object of its scene.
         suite, base: suite and name of the LIBERO task or of the user's own task.
         name: name of the test task in LIBERO-Plus, else a name that is composed of the other fields. It is unique among
             the tasks of its source and suite.
