@@ -23,11 +23,13 @@ from vla_eval.recording import EpisodeRecorder, RecordingStore, db_path_for_eval
 from vla_eval.results.export import export_eval
 
 from pipeline.axes import level_of_test
+from pipeline.commands.command_line import run as command
 from pipeline.errors import PipelineError
 from pipeline.evaluation.other_programs import read_tested
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.evaluation.tested import Outcome, TestedPolicy
+from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.report.paper_rows import COLUMNS, csv_text, latex, markdown
 from pipeline.report.paper_table import table_of
 from pipeline.seeding import rng
@@ -190,6 +192,31 @@ def test_analyze_table_prints_and_writes_the_table(tmp_path: Path, capsys: pytes
     assert analyze("table", str(tmp_path / "act"), "--out", str(out)) == 1
     assert "would overwrite" in capsys.readouterr().err
     assert written[2].read_text() == "notes of a user"
+
+
+@pytest.mark.slow
+def test_evaluate_prints_and_writes_the_table_of_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(STEP_LIMITS, "libero_goal", 2)
+    out = tmp_path / "replay"
+    rows: dict[str, list[str]] = {}
+    for axis in ("robot", "language"):
+        options = ["--source", "libero_plus", "--axis", axis, "--suite", "libero_goal", "--subset", "2"]
+        assert command(["evaluate", str(out), "--replay", *options, "--workers", "1"]) == 0
+        printed = capsys.readouterr().out
+        rows = of_markdown(printed)
+        assert rows == of_markdown((out / "paper_table.md").read_text())
+        assert json.loads(printed.splitlines()[-1])["by_axis"].keys() == {axis}
+    cells = dict(zip(COLUMNS, rows["replay"], strict=True))
+    assert [name for name in COLUMNS if cells[name] != "-"] == ["robot", "language"], "of both calls"
+    assert rows["replay, tasks run"][1:3] == ["2 of 1,550", "2 of 1,537"]
+    line = of_csv((out / "paper_table.csv").read_text())["replay"]
+    assert (line["total_tasks_run"], line["step_limits"], line["program"]) == ("4", "goal 2", "evaluate")
+    assert of_latex((out / "paper_table.tex").read_text())[0][0] == "replay"
+    (out / "paper_table.csv").write_text("a user's own file")
+    assert command(["evaluate", str(out), "--replay", *options, "--workers", "1"]) == 1
+    assert (out / "paper_table.csv").read_text() == "a user's own file"
 
 
 def test_results_without_test_tasks_are_named(tmp_path: Path) -> None:
