@@ -17,6 +17,7 @@ analyze = LazyGroup(
     sections={
         "Commands": {
             "report": Listed("analyze", "Write an HTML page and a JSON file about evaluations."),
+            "table": Listed("analyze", "Print the paper's table, with policies next to published models."),
             "coverage": Listed("analyze", "Compare the observations of a run with those of the test tasks."),
             "gap": Listed("analyze", "Measure the compositional gap of pairs of perturbations."),
             "construct": Listed("analyze", "Sample and balance a benchmark of held-out perturbations."),
@@ -55,6 +56,41 @@ def report(folders: tuple[Path, ...], across: tuple[Any, ...], out: Path) -> Non
     from pipeline.report import evaluation_report
 
     print(json.dumps(evaluation_report.write(read(folders, across), out)))
+
+
+@click.command(cls=Command, epilog=example("analyze table results/act results/vla_eval --out table"))
+@click.argument(
+    "results",
+    metavar="PATH...",
+    nargs=-1,
+    required=True,
+    type=PATH,
+    help="Folders of `evaluate`; folders or files of vla-eval (*_aggregate.json) and lerobot-eval (eval_info.json).",
+)
+@click.option(
+    "--out",
+    metavar="NAME",
+    type=PATH,
+    help="Write NAME.md, NAME.csv and NAME.tex, too (default: print only).",
+)
+def table(results: tuple[Path, ...], out: Path | None) -> None:
+    """Print the paper's table on LIBERO-Plus's test tasks as Markdown, with policies next to published models.
+
+    The columns are the benchmark's seven dimensions, the total over tasks and the mean of the seven. Each policy states
+    its tasks, prompt, step limits and trials. A policy of vla-eval or lerobot-eval has the name of its folder. The last
+    line of the output is JSON.
+    """
+    from pipeline.evaluation.other_programs import read_tested
+    from pipeline.report import paper_rows
+    from pipeline.report.paper_table import table_of
+
+    if out is not None:
+        out = out.with_suffix("") if out.suffix in paper_rows.MARKS else out
+        paper_rows.refuse_other_tables(out)
+    found = table_of(read_tested(results))
+    print(paper_rows.markdown(found))
+    files = [] if out is None else [str(file) for file in paper_rows.write_table(found, out)]
+    print(json.dumps({"files": files, "rows": {row["name"]: row for row in found["evaluated"]}}))
 
 
 @click.command(cls=Command, epilog=example("analyze coverage configs/starter.yaml"))

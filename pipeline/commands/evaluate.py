@@ -14,6 +14,9 @@ from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import evaluate as run_evaluation
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
+from pipeline.evaluation.tested import tested_in
+from pipeline.report import paper_rows
+from pipeline.report.paper_table import table_of
 from pipeline.run import claim
 
 TRAINED_ON = "Configuration of the policy's training data; held-out perturbations that overlap with it are resampled."
@@ -59,8 +62,16 @@ TRAINED_ON = "Configuration of the policy's training data; held-out perturbation
     initial_states="--initial-states",
     look_every="--look-every",
     actions="--actions",
+    own_step_limit="--own-step-limit",
 )
 @model_options(PolicyConfig, label="--label", timeout_s="--timeout")
+@click.option(
+    "--demos",
+    metavar="DIR",
+    type=PATH,
+    help="Folder of demonstrations, <suite>/<task>_demo.hdf5, for --initial-states demonstration, --replay and "
+    "held-out perturbations (default: the starter set).",
+)
 @click.option("--assets", metavar="DIR", type=PATH, help="Folder of the unpacked asset archive of LIBERO-Plus.")
 @click.option(
     "--videos",
@@ -82,11 +93,12 @@ def evaluate(
     workers: int | None,
     **options: Any,
 ) -> None:
-    """Run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out perturbations of the axes.
+    """Run a policy on LIBERO's tasks or your own, on LIBERO-Plus's test tasks or on held-out perturbations.
 
     The command writes a file for each episode into DIR, and summary.json with success rates and their 95 % intervals.
     The policy is a model server of vla-eval, which you start first, or a checkpoint of lerobot. A stopped evaluation
-    resumes when the command is called again. The last line of the output is JSON.
+    resumes when the command is called again. For test tasks of LIBERO-Plus, the command prints the paper's table of all
+    results in DIR, and writes it into DIR as paper_table.md, .csv and .tex. The last line of the output is JSON.
     """
     policies = {"server": server, "checkpoint": checkpoint, "replay": replay}
     chosen = [name for name, value in policies.items() if value is not None]
@@ -98,8 +110,20 @@ def evaluate(
     plan = {"plan": claim.owned(trained_on).plan_file} if trained_on else {}
     settings = EpisodeSettings.model_validate(given(options, EpisodeSettings) | plan)
     evaluation = Evaluation(settings, config, config.identity(), out, videos=videos, archive=assets)
+    table_path = out / "paper_table"
+    paper_rows.refuse_other_tables(table_path)
     number = workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if number == 1 else "local", workers=number)
     with runner(compute, out, renders=True) as pool:
         summary = run_evaluation(evaluation, Selection.model_validate(given(options, Selection)), pool, number)
+    _print_table(evaluation, table_path)
     print(json.dumps({"all": summary["all"], "refused": summary["refused"], "by_axis": summary["by_axis"]}))
+
+
+def _print_table(evaluation: Evaluation, path: Path) -> None:
+    """Print and write the paper's table of an evaluation's results on test tasks, if it has any."""
+    tested = evaluation.test_results()
+    if tested:
+        found = table_of([tested_in(evaluation.policy.name(evaluation.identity), tested)])
+        print(paper_rows.markdown(found))
+        paper_rows.write_table(found, path)

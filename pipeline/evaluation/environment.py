@@ -17,12 +17,12 @@ from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import libero_plus, own_draws
 from pipeline.evaluation.actions import Actions, checked_actions
 from pipeline.evaluation.policies import VIEWS, Wanted
+from pipeline.evaluation.recordings import demonstration
 from pipeline.evaluation.results import REFUSED
 from pipeline.evaluation.simulator import Picture, Simulator
 from pipeline.evaluation.tasks import EvaluationTask, Prompt, find_replacement, libero_states
-from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import recorded_start
-from pipeline.libero.tasks import STEP_LIMITS, find_task
+from pipeline.libero.tasks import STEP_LIMITS, SUITES, find_task
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import SceneFiles
@@ -43,8 +43,9 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     fixture_seed: int = 0
     """seed of LIBERO's reset, to which the number of the initial state is added; OpenVLA uses 0"""
     initial_states: Literal["libero", "demonstration"] = "libero"
-    """LIBERO's initial states for evaluation, or the first state of the starter set's demonstration, one episode per
-    task; test tasks have their own state, and goals begin in LIBERO's states"""
+    """LIBERO's initial states for evaluation, or the first states of demonstrations, one episode per demonstration;
+    own tasks have no LIBERO states and begin in LIBERO's reset instead; test tasks have their own state, and goals
+    begin in LIBERO's states"""
     # Fields that were added later are left out of an episode's name if they have their default: names stay equal.
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
     """views that are black, to test a policy without them"""
@@ -58,12 +59,31 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     the server takes from each chunk"""
     step_limits: Literal["openvla", "lerobot"] = Field(default="openvla", exclude_if=lambda limits: limits == "openvla")
     """source of the step limits: they differ in libero_spatial, 220 (openvla) and 280 (lerobot)"""
+    own_step_limit: int | None = Field(default=None, ge=1, exclude_if=lambda limit: limit is None)
+    """step limit of the user's own tasks, for which LIBERO has none"""
+    demos: Path | None = Field(default=None, exclude=True)
+    """folder of demonstrations, ``<suite>/<task>_demo.hdf5``; by default the starter set, which has LIBERO's tasks
+    alone. Results name their demonstration by its content."""
     runner: Literal["pipeline", "lerobot-eval"] = Field(default="pipeline", exclude_if=lambda name: name == "pipeline")
     """program that runs the policy: lerobot-eval has its own batches and random numbers, so a policy may act
     differently there than in ``evaluate``"""
 
     def step_limit(self, suite: str) -> int:
-        """Return the step limit of an episode in a suite."""
+        """Return the step limit of an episode in a suite.
+
+        Raises:
+            PipelineError: if the suite is a user's own, and no limit is set.
+        """
+        if suite not in STEP_LIMITS:
+            if self.own_step_limit is None:
+                raise PipelineError(
+                    f"LIBERO has no step limit for your suite {suite}",
+                    where="own_step_limit",
+                    expected="a number of control steps, 20 per second; LIBERO's limits are 3 to 14 % above its "
+                    "longest demonstrations",
+                    remedy="add --own-step-limit N",
+                )
+            return self.own_step_limit
         lerobots = self.step_limits == "lerobot" and suite == "libero_spatial"
         return LEROBOT_SPATIAL if lerobots else STEP_LIMITS[suite]
 
@@ -238,16 +258,21 @@ class EpisodeEnvironment:
         self._start(*self._initial_state())
 
     def _start_libero(self) -> None:
-        """Start an episode of a LIBERO task, with held-out perturbations if the task has any."""
+        """Start an episode of a LIBERO task or an own task, with held-out perturbations if the task has any."""
         self._build(self._base)
-        seed, demo, recorded = self.settings.fixture_seed, StarterSource().demonstration(self._base), True
-        if self.settings.initial_states == "libero":
+        seed, recorded = self.settings.fixture_seed, self.settings.initial_states == "demonstration"
+        if not recorded:
             seed, state = self._initial_state()
-            demo, recorded = replace(demo, init_state=state), False
+            if self.task.source == "libero":
+                self._start(seed, state)
+                return
+        demo = demonstration(self._base, self.task.number, self.settings.demos)
+        if not recorded:
+            demo = replace(demo, init_state=state, states=None, model_xml=None)
 
         def nominal() -> Scene:
             """Return the scene without perturbations."""
-            scene = recorded_start(demo, self.simulator.place_fixtures(seed))
+            scene = recorded_start(demo, demo.model_xml or self.simulator.place_fixtures(seed))
             # A recording begins with an open gripper. LIBERO restores its own states after its reset, which leaves the
             # gripper without a command.
             return scene if recorded else replace(scene, gripper=0.0)
@@ -272,7 +297,10 @@ class EpisodeEnvironment:
         self._picture.show(self.simulator.model, self.perturbations)
 
     def _initial_state(self) -> tuple[int, Floats]:
-        """Return the seed of LIBERO's reset and LIBERO's initial state for this task."""
+        """Return the seed of LIBERO's reset, and LIBERO's initial state for this task or a reset's state."""
+        if self._base.suite not in SUITES:
+            seed = self.settings.fixture_seed + self.task.number
+            return seed, self.simulator.state_of_reset(seed)
         states = libero_states(self._base)
         number = self.task.number % len(states)
         return self.settings.fixture_seed + number, states[number]

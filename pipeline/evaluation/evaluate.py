@@ -16,8 +16,8 @@ from pipeline import gl
 from pipeline.axes import AXES
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
-from pipeline.evaluation import own_draws
-from pipeline.evaluation.actions import Actions, PolicyError
+from pipeline.evaluation import own_draws, recordings
+from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Policy, warn_of_single_view
 from pipeline.evaluation.results import one_setting
@@ -27,6 +27,7 @@ from pipeline.evaluation.statistics import summary
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import write, write_json
 from pipeline.images.mp4 import mp4
+from pipeline.libero.tasks import SUITES, find_task
 from pipeline.types import Frame
 
 EPISODES_A_JOB = 10
@@ -159,16 +160,49 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
                 expected="tasks of libero and own",
                 remedy="leave --initial-states out",
             )
-        starts = Counter(f"{task.suite}/{task.base}" for task in wanted if task.source == "libero")
-        repeated = [name for name, count in starts.items() if count > 1]
-        if repeated:
-            name = repeated[0]
+        starts = Counter((task.suite, task.base) for task in wanted if task.source == "libero")
+        for (suite, name), episodes in starts.items():
+            count = recordings.count_of(find_task(suite, name), settings.demos)
+            if episodes > count:
+                raise PipelineError(
+                    f"{episodes - count} of {episodes} episodes of {suite}/{name} would be repetitions, because it has "
+                    f"{count} demonstration{'s' if count > 1 else ''}",
+                    where="initial_states",
+                    expected="at most one episode of each demonstration",
+                    remedy=f"set --episodes {count}, or leave --initial-states out",
+                )
+    _check_own_tasks(wanted, settings)
+
+
+def _check_own_tasks(wanted: Sequence[EvaluationTask], settings: EpisodeSettings) -> None:
+    """Reject settings that do not fit the user's own tasks.
+
+    Raises:
+        PipelineError: if own tasks lack a step limit or demonstrations, or if no selected task needs such a setting.
+    """
+    own_tasks = [task for task in wanted if task.suite not in SUITES]
+    if not own_tasks:
+        if settings.own_step_limit is not None:
             raise PipelineError(
-                f"{starts[name]} episodes of {name} would be equal, because it has one demonstration",
-                where="initial_states",
-                expected="one episode of each task of libero",
-                remedy="set --episodes 1, or leave --initial-states out",
+                "LIBERO's suites have their own step limits, and no task of yours is selected",
+                where="own_step_limit",
+                expected="a suite of your own, by --suite",
+                remedy="leave --own-step-limit out",
             )
+        return
+    task = find_task(own_tasks[0].suite, own_tasks[0].base)
+    if settings.own_step_limit is None and settings.demos is not None:
+        longest = recordings.longest_steps(task, settings.demos)
+        raise PipelineError(
+            f"LIBERO has no step limit for your suite {task.suite}",
+            where="own_step_limit",
+            expected=f"more than the {longest} steps of the longest demonstration of {task.name}; LIBERO's limits are "
+            "3 to 14 % above its longest demonstrations",
+            remedy="add --own-step-limit N",
+        )
+    settings.step_limit(task.suite)
+    for suite, name in {(one.suite, one.base) for one in own_tasks if one.source == "own"}:
+        recordings.count_of(find_task(suite, name), settings.demos)
 
 
 @dataclass(frozen=True)
@@ -201,7 +235,7 @@ class EvaluationJob:
             )
         settings, archive = self.evaluation.settings, self.evaluation.archive
         environment = _environment(settings, archive)
-        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every, settings.actions)
+        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings)
         faults = {}
         # A lost worker may have finished some episodes of this job.
         for task in self._missing():
@@ -267,13 +301,13 @@ def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvi
 
 
 @lru_cache(maxsize=1)
-def _policy(policy_config: PolicyConfig, identity: str, look_every: int, actions: Actions) -> Policy:
+def _policy(policy_config: PolicyConfig, identity: str, settings: EpisodeSettings) -> Policy:
     """Return this process's policy.
 
     Raises:
         PipelineError: if it is not the policy with which the evaluation began.
     """
-    policy = policy_config.open(look_every, actions)
+    policy = policy_config.open(settings.look_every, settings.actions, settings.demos)
     # The identity is computed after loading: files that changed before they were loaded still differ now.
     if policy_config.identity() != identity:
         raise PipelineError(

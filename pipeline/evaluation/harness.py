@@ -198,20 +198,24 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
 
 class ReplayServer(ModelServer):  # type: ignore[misc]
-    """Model server that answers with the actions of the starter set's demonstration of the task.
+    """Model server that answers with the actions of a demonstration of the task.
 
     Args:
         chunk: number of actions in each answer; all are taken before the next observation. Without effect if tracked.
         tracked: follow the demonstration's path by the state in each observation, one action at a time.
+        demos: folder of the demonstrations; by default the starter set.
     """
 
-    def __init__(self, *, chunk: int = 1, tracked: bool = False):
+    def __init__(self, *, chunk: int = 1, tracked: bool = False, demos: str | None = None):
         self._chunk, self._tracked = chunk, tracked
+        self._demos = None if demos is None else Path(demos)
         self._replays: dict[str, Replay | TrackedReplay] = {}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         """Begin a replay of the episode's demonstration."""
-        replay: Replay | TrackedReplay = TrackedReplay() if self._tracked else Replay(self._chunk)
+        replay: Replay | TrackedReplay = Replay(self._chunk, self._demos)
+        if self._tracked:
+            replay = TrackedReplay(self._demos)
         self._replays[ctx.session_id] = replay
         replay.begin(EvaluationTask.of_harness(config["task"]))
 

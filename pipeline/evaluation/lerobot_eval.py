@@ -63,6 +63,9 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
     prompt: str = "clean"
     step_limits: str = "openvla"
     actions: str = "delta"
+    initial_states: str = "libero"
+    own_step_limit: int | None = None
+    demos: str | None = None
     out: str | None = None
     label: str = ""
     assets: str | None = None
@@ -95,7 +98,8 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
                 expected="1",
                 remedy="set --eval.batch_size to run several episodes at the same time",
             )
-        given = {name: getattr(self, name) for name in ("prompt", "seed", "step_limits", "actions")}
+        settings_named = ("prompt", "seed", "step_limits", "actions", "initial_states", "own_step_limit", "demos")
+        given = {name: getattr(self, name) for name in settings_named}
         settings = EpisodeSettings.model_validate({**given, "runner": "lerobot-eval"})
         archive = None if self.assets is None else Path(self.assets)
         evaluation = self._evaluation(settings, archive)

@@ -1,23 +1,23 @@
-"""Scripted policies that repeat the starter set's demonstration of a task, to check an evaluation."""
+"""Scripted policies that repeat a demonstration of a task, to check an evaluation."""
 
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
-from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.evaluation.policies import Look, Wanted
+from pipeline.evaluation.recordings import demonstration
 from pipeline.evaluation.simulator import Simulator
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import DUMMY_ACTION
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Hand, Route, follow
-from pipeline.types import Floats
+from pipeline.types import Demo, Floats
 
 
 class Replay:
@@ -25,17 +25,18 @@ class Replay:
 
     Args:
         chunk: number of actions per answer.
+        demos: folder of the demonstrations; by default the starter set.
     """
 
     name = "replay"
     wanted = Wanted(wrist=False, state=False, images=False)
 
-    def __init__(self, chunk: int = 8):
-        self._chunk = chunk
+    def __init__(self, chunk: int = 8, demos: Path | None = None):
+        self._chunk, self._demos = chunk, demos
 
     def begin(self, task: EvaluationTask) -> None:
         """Begin with the first action of the task's demonstration."""
-        recorded = StarterSource().demonstration(find_task(task.suite, task.base)).actions
+        recorded = demonstration(find_task(task.suite, task.base), task.number, self._demos).actions
         self._actions, self._taken = recorded[kept_actions(recorded, "drop")], 0
 
     def act(self, look: Look) -> Floats:
@@ -54,14 +55,20 @@ class TrackedReplay:
     The control law is that of the tracked replay that generates datasets (``pipeline.physics.tracking``). The policy
     knows the end effector's pose from observations, but not the poses of objects. Therefore it follows the
     demonstration's path from any start of the arm.
+
+    Args:
+        demos: folder of the demonstrations; by default the starter set.
     """
 
     name = "tracked replay"
     wanted = Wanted(wrist=False, images=False)
 
+    def __init__(self, demos: Path | None = None):
+        self._demos = demos
+
     def begin(self, task: EvaluationTask) -> None:
         """Begin with the task's demonstration as the reference."""
-        self._reference = _reference(task.suite, task.base)
+        self._reference = _reference(demonstration(find_task(task.suite, task.base), task.number, self._demos))
         self._actions: Iterator[Floats] | None = None
 
     def act(self, look: Look) -> Floats:
@@ -79,13 +86,23 @@ class TrackedReplay:
         """End the episode, without effect on the policy."""
 
 
-@lru_cache(maxsize=8)
-def _reference(suite: str, base: str) -> Reference:
-    """Return the demonstration as observations show it, replayed open-loop from its own first state."""
-    demo = StarterSource().demonstration(find_task(suite, base))
+_references: dict[str, Reference] = {}
+"""SHA-256 of the last demonstration to its reference."""
+
+
+def _reference(demo: Demo) -> Reference:
+    """Return a demonstration as observations show it, replayed open-loop from its own first state."""
+    if demo.sha256 not in _references:
+        _references.clear()
+        _references[demo.sha256] = _replayed(demo)
+    return _references[demo.sha256]
+
+
+def _replayed(demo: Demo) -> Reference:
+    """Replay a demonstration open-loop, and return its observations as a reference."""
     actions = demo.actions[kept_actions(demo.actions, "drop")]
     with closing(Simulator(demo.task)) as simulator:
-        scene = recorded_start(demo, simulator.place_fixtures(0))
+        scene = recorded_start(demo, demo.model_xml or simulator.place_fixtures(0))
         simulator.start_scene(scene)
         states, observed = [simulator.state], [simulator.observed.state]
         for action in actions:

@@ -22,7 +22,7 @@ ALIKE = {"actions": "delta", "black": "none", "initial_states": "libero", "fixtu
 """Settings, and their values if a result leaves them out. Results on one suite of one source can be compared only if
 these settings, the prompt and the step limit are equal."""
 
-PER_TASK = ("draws", "files of the benchmark")
+PER_TASK = ("draws", "files of the benchmark", "definition of the task", "demonstration")
 """Versions of a result that differ between tasks."""
 
 Trial = tuple[EvaluationTask, int, str]

@@ -17,13 +17,15 @@ from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.axes.component_names import stored_names
 from pipeline.errors import PipelineError
-from pipeline.evaluation import libero_plus, own_draws
+from pipeline.evaluation import libero_plus, own_draws, recordings
 from pipeline.evaluation.actions import Actions, checked_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.results import PER_TASK, EpisodeFiles, EpisodeResult, refuse_shared_names
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.files import checksum_of, edition
+from pipeline.libero.tasks import SUITES, find_task
 from pipeline.record import Basis, Record
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
@@ -88,17 +90,21 @@ class PolicyConfig(Frozen, use_attribute_docstrings=True):
         scripts = {"open_loop": "replay", "tracked": "tracked replay"}
         return self.label or scripts.get(self.kind) or f"{self.address} {identity.removeprefix('sha256:')[:8]}"
 
-    def open(self, look_every: int, actions: Actions) -> Policy:
-        """Load the policy, or connect to its server."""
+    def open(self, look_every: int, actions: Actions, demos: Path | None = None) -> Policy:
+        """Load the policy, or connect to its server.
+
+        Args:
+            demos: folder of the demonstrations that a replay repeats; by default the starter set.
+        """
         match self.kind:
             case "server":
                 return Server(self.address, self.timeout_s, look_every, actions)
             case "checkpoint":
                 return Checkpoint(Path(self.address))
             case "open_loop":
-                return Replay()
+                return Replay(demos=demos)
             case "tracked":
-                return TrackedReplay()
+                return TrackedReplay(demos)
 
 
 @dataclass(frozen=True)
@@ -134,6 +140,21 @@ class Evaluation:
         row = self.files.row(self.episode(task))
         return row if row is not None and _record(row).matches(self.basis(task)) else None
 
+    def test_results(self) -> list[EpisodeResult]:
+        """Read the up-to-date results on test tasks of this policy under these settings, of any selection.
+
+        Raises:
+            PipelineError: if a file is not a result of this version.
+        """
+        results: list[EpisodeResult] = []
+        for row in self.files.rows():
+            if row.source != "libero_plus":
+                continue
+            task, *_ = row.trial
+            if row.episode == self.episode(task) and _record(row).matches(self.basis(task)):
+                results.append(row)
+        return results
+
     def check(self, tasks: Iterable[EvaluationTask]) -> None:
         """Reject a folder that this evaluation must not write into.
 
@@ -167,7 +188,17 @@ class Evaluation:
                 versions["files of the benchmark"] = digest(contents)[:16]
         if task.source == "own":
             versions["draws"] = own_draws.first_draws(task, self.settings.seed)
+        base, demos = find_task(task.suite, task.base), self.settings.demos
+        if task.suite not in SUITES:
+            versions["definition of the task"] = checksum_of(edition(base.bddl_file))[:16]
+        if demos is not None and self._uses_demonstration(task):
+            versions["demonstration"] = recordings.content_of(base, task.number, demos)[:16]
         return versions
+
+    def _uses_demonstration(self, task: EvaluationTask) -> bool:
+        """Return whether a result depends on a demonstration of the task."""
+        starts = task.source == "own" or self.settings.initial_states == "demonstration"
+        return starts or self.policy.kind in ("open_loop", "tracked")
 
     def save(self, environment: EpisodeEnvironment, wanted: Wanted) -> None:
         """Write the result of the episode that ended in an environment.

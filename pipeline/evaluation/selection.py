@@ -25,7 +25,7 @@ from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_ta
 from pipeline.evaluation.results import REFUSED, EpisodeResult
 from pipeline.evaluation.task_list import read_tasks
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task, replacements
-from pipeline.libero.tasks import SUITES, find_task, tasks
+from pipeline.libero.tasks import SUITES, find_task, suites, tasks
 from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Task
 
@@ -51,13 +51,13 @@ class Selection(Frozen, use_attribute_docstrings=True):
     """Selection of tasks; a field that is left out does not restrict it."""
 
     source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
-    """LIBERO's tasks; LIBERO-Plus's test tasks; held-out perturbations on this project's axes (``own``); LIBERO's tasks
-    asked for another object of their scene (``goals``); for every two axes LIBERO's task, a held-out perturbation on
-    either, and both together, on the same initial states (``pairs``)"""
+    """LIBERO's tasks and the user's own; LIBERO-Plus's test tasks; held-out perturbations on this project's axes
+    (``own``); LIBERO's tasks asked for another object of their scene (``goals``); for every two axes the task, a
+    held-out perturbation on either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
     """list of tasks that ``analyze construct`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES
-    """only these suites"""
+    """only these suites; suites of the user's own tasks must be named"""
     axes: tuple[str, ...] = ()
     """only these axes"""
     components: tuple[ComponentName, ...] = ()
@@ -67,8 +67,8 @@ class Selection(Frozen, use_attribute_docstrings=True):
     tasks: tuple[str, ...] = ()
     """shell-style patterns, one of which must match the name of the task or of its LIBERO task"""
     episodes: int = Field(default=1, ge=1)
-    """number of LIBERO's 50 initial states per task; for ``own``, number of perturbations per task, axis and level,
-    whose initial states repeat from the 51st on"""
+    """number of LIBERO's 50 initial states per task, of resets of an own task, or of demonstrations; for ``own``,
+    number of perturbations per task, axis and level, whose initial states repeat from the 51st on"""
     subset: int | None = Field(default=None, ge=1)
     """largest number of tasks, spread evenly over suites, axes, components and levels"""
     seed: int = 0
@@ -108,7 +108,8 @@ def _check_names(selection: Selection) -> None:
     """
     # The benchmark leaves LIBERO-90 out.
     of_benchmark = selection.source == "libero_plus" and selection.file is None
-    _check_known("suites", selection.suites, TESTED_SUITES if of_benchmark else SUITES, selection)
+    valid = TESTED_SUITES if of_benchmark else SUITES if selection.source == "goals" else suites()
+    _check_known("suites", selection.suites, valid, selection)
     if selection.episodes > 1 and (of_benchmark or selection.file is not None):
         raise PipelineError(
             f"{selection.file or selection.source} has one episode of each task",
@@ -124,7 +125,8 @@ def _check_names(selection: Selection) -> None:
                 remedy="leave --source or --tasks-from out",
             )
         return
-    if selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
+    of_libero = bool({*selection.suites} & {*SUITES})
+    if of_libero and selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
         raise PipelineError(
             f"a task has {INITIAL_STATES} initial states, not {selection.episodes}",
             where="episodes",
@@ -240,7 +242,7 @@ def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> Non
     names: set[str] = set()
     for task in listed:
         names |= {task.name, task.base}
-    for suite in SUITES:
+    for suite in suites():
         names |= {task.name for task in tasks(suite)}
     for pattern in selection.tasks:
         if not fnmatch.filter(names, pattern):

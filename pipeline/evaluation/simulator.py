@@ -132,6 +132,15 @@ class Simulator(Environment):
         self._observe_from_here()
         self.settle(SETTLING_STEPS)
 
+    def state_of_reset(self, seed: int) -> Floats:
+        """Return the state (S,) of a reset under a seed, as LIBERO's initial states: objects in the task's regions.
+
+        The reset that ``start`` kept is discarded.
+        """
+        self._rewind = None
+        self.reset(seed)
+        return self.state
+
     def place_fixtures(self, seed: int) -> str:
         """Place the fixtures, see ``Environment``, and discard the reset that ``start`` kept."""
         self._rewind = None

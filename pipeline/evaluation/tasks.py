@@ -45,15 +45,17 @@ class EvaluationTask:
     """Identification of one task in one scene; everything else about the task is looked up by these fields.
 
     Attributes:
-        source: ``libero``, ``libero_plus``, ``own`` for held-out perturbations on one or more of this project's axes,
-            or ``goals`` for a LIBERO task that asks for another object of its scene.
-        suite, base: suite and name of the LIBERO task.
+        source: ``libero`` for a task without perturbation, also a user's own. ``libero_plus`` for a test task. ``own``
+            for held-out perturbations on one or more of this project's axes. ``goals`` for a LIBERO task that asks for
+            another object of its scene.
+        suite, base: suite and name of the LIBERO task or of the user's own task.
         name: name of the test task in LIBERO-Plus, else a name that is composed of the other fields. It is unique among
             the tasks of its source and suite.
         axis, component: perturbed axis and component, several joined by +; ``clean`` without a perturbation. In
             ``goals`` the component is the category of the object that is asked for.
         level: strength of all perturbations, 1 to 5; 0 if it is unknown.
-        number: number of the perturbation (``own``), and of LIBERO's initial state; 0 in ``libero_plus``.
+        number: number of the perturbation (``own``), and of the initial state, the reset or the demonstration; 0 in
+            ``libero_plus``.
     """
 
     source: Source
@@ -95,7 +97,7 @@ class EvaluationTask:
 
 
 def libero_task(task: Task, number: int) -> EvaluationTask:
-    """Return LIBERO's own task, from its initial state with a number."""
+    """Return a task without perturbation, from its initial state with a number."""
     return EvaluationTask("libero", task.suite, task.name, f"{task.name}_state{number}", "clean", "clean", 0, number)
 
 

@@ -17,7 +17,7 @@ TITLES = {
     "libero_plus": "LIBERO-Plus's test tasks",
     "own": "Held-out perturbations of this project's axes",
     "goals": "Other goals in LIBERO's scenes",
-    "libero": "LIBERO's tasks, unperturbed",
+    "libero": "Tasks without perturbation",
 }
 """Titles of the sources of tasks; the title of any other source is its name."""
 

@@ -21,7 +21,8 @@ from pipeline.evaluation.statistics import compare, grade, mcnemar, paired
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.report import evaluation_report
-from pipeline.report.evaluation_findings import FAILURES, paper_table
+from pipeline.report.evaluation_findings import FAILURES
+from pipeline.report.paper_table import paper_table
 from pipeline.testset import benchmark
 
 

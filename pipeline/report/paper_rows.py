@@ -1,0 +1,278 @@
+"""The paper's table as Markdown, CSV and LaTeX rows, with equal numbers."""
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipeline.files import refuse_other_file, write
+from pipeline.report.paper_table import DIMENSIONS
+
+COLUMNS = (*DIMENSIONS, "total", "mean of seven")
+"""Headings of the rates."""
+
+SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal": "goal", "libero_10": "long"}
+"""Suite to its short name in the paper's order."""
+
+NOT_STATED = "not stated"
+
+MARKS = {
+    ".md": f"| model | {' | '.join(COLUMNS)} |",
+    ".csv": "model,published,program,prompt,step_limits",
+    ".tex": f"% model & {' & '.join(COLUMNS)} \\\\",
+}
+"""Suffix of each file to a text that all these files contain."""
+
+LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    **{character: f"\\{character}" for character in "&%$#_"},
+}
+"""Character to its LaTeX command, for characters that LaTeX does not print as they are."""
+
+
+class Row(NamedTuple):
+    """One model's row, with each number as all formats print it.
+
+    Attributes:
+        rates: heading to the rate in percent; `None` if it was not measured.
+        intervals: heading to the bounds of the 95 % interval in percent, of measured rates.
+        partial: headings whose rate leaves out a part of the benchmark.
+        tasks_run: heading of a column, or ``total``, to the number of test tasks with an episode.
+        absent: column to the left-out parts.
+    """
+
+    name: str
+    published: bool
+    program: str
+    prompt: str
+    step_limits: str
+    trials: str
+    left_out: int
+    rates: Mapping[str, str | None]
+    intervals: Mapping[str, tuple[str, str]]
+    partial: frozenset[str]
+    tasks_run: Mapping[str, int]
+    absent: Mapping[str, str]
+
+
+def rows_of(table: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of a table: evaluated policies, then published models.
+
+    Args:
+        table: the result of ``table_of``.
+    """
+    return [
+        *(_evaluated(row) for row in table["evaluated"]),
+        *(_published(row, table) for row in table["published"]),
+    ]
+
+
+def _evaluated(row: Mapping[str, Any]) -> Row:
+    """Return the row of an evaluated policy."""
+    cells, protocol = row["cells"], row["protocol"]
+    estimates = {**cells, "total": row["total"], "mean of seven": row["mean"]}
+    measured = {heading: estimate for heading, estimate in estimates.items() if estimate is not None}
+    absent = {column: cell["absent"] for column, cell in cells.items() if cell["absent"]}
+    tasks_run = {column: cells[column]["tasks"] if column in cells else 0 for column in DIMENSIONS}
+    fewest, most = protocol["trials"]
+    return Row(
+        name=row["name"],
+        published=False,
+        program=protocol["program"],
+        prompt=protocol["prompt"] or NOT_STATED,
+        step_limits=_limits(protocol["step_limits"]),
+        trials=str(fewest) if fewest == most else f"{fewest} to {most}",
+        left_out=protocol["left_out"],
+        rates={heading: _percent(measured[heading]["rate"]) if heading in measured else None for heading in COLUMNS},
+        intervals={name: (_percent(one["low"]), _percent(one["high"])) for name, one in measured.items()},
+        partial=frozenset([*absent, "total", "mean of seven"] if absent else ()),
+        tasks_run={**tasks_run, "total": sum(tasks_run.values())},
+        absent=absent,
+    )
+
+
+def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> Row:
+    """Return the row of a published model, whose rates are in percent."""
+    protocol = table["protocol"]
+    rates = {**row["rates"], "total": row["total"], "mean of seven": row["mean"]}
+    return Row(
+        name=row["name"],
+        published=True,
+        program=table["source"],
+        prompt=protocol["prompt"],
+        step_limits=protocol["step_limits"],
+        trials=str(protocol["trials"]),
+        left_out=0,
+        rates={heading: f"{rates[heading]:.1f}" for heading in COLUMNS},
+        intervals={},
+        partial=frozenset(),
+        tasks_run={**table["tasks"], "total": protocol["tasks_run"]},
+        absent={},
+    )
+
+
+def _percent(rate: float) -> str:
+    """Return a rate in [0, 1] as percent."""
+    return f"{100 * rate:.1f}"
+
+
+def _limits(limits: Mapping[str, Sequence[int]]) -> str:
+    """Describe the step limits of the suites that were run."""
+    if not limits:
+        return NOT_STATED
+    parts = []
+    for suite in sorted(limits, key=list(SUITES).index):
+        parts.append(f"{SUITES[suite]} {' or '.join(map(str, limits[suite]))}")
+    return ", ".join(parts)
+
+
+def markdown(table: Mapping[str, Any]) -> str:
+    """Return the table as Markdown, with the protocol of each evaluated policy and the left-out parts."""
+    lines = [MARKS[".md"], f"|---|{'---:|' * len(COLUMNS)}"]
+    rows = rows_of(table)
+    sizes = {**table["tasks"], "total": sum(table["tasks"].values())}
+    for row in rows:
+        cells = [_starred(row, heading, "*") or "-" for heading in COLUMNS]
+        lines.append(_line(f"{row.name} (published)" if row.published else row.name, cells))
+        if not row.published:
+            bounds = [" to ".join(row.intervals[name]) if name in row.intervals else "" for name in COLUMNS]
+            lines.append(_line(f"{row.name}, 95 % interval", bounds))
+            counts = [f"{row.tasks_run[name]:,} of {sizes[name]:,}" if name in sizes else "" for name in COLUMNS]
+            lines.append(_line(f"{row.name}, tasks run", counts))
+    lines.append("")
+    for row in rows:
+        lines += _notes(row)
+    protocol = table["protocol"]
+    lines.append(
+        f"- Published ({table['source']}): {protocol['tasks_run']:,} tasks; {protocol['trials']} trial per task; "
+        f"prompt {protocol['prompt']}; step limits {protocol['step_limits']}; the mean of seven is computed from the "
+        "columns."
+    )
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, cells: Sequence[str]) -> str:
+    """Return a line of a Markdown table."""
+    escaped = " ".join(name.split()).replace("|", "\\|")
+    return f"| {' | '.join([escaped, *cells])} |"
+
+
+def _starred(row: Row, heading: str, star: str) -> str:
+    """Return a rate, with a star if it leaves out a part of the benchmark; empty if it was not measured."""
+    rate = row.rates[heading]
+    if rate is None:
+        return ""
+    return rate + star if heading in row.partial else rate
+
+
+def _notes(row: Row) -> Iterator[str]:
+    """Yield the protocol of an evaluated policy and its left-out parts, each as a line of a Markdown list."""
+    if row.published:
+        return
+    name = " ".join(row.name.split())
+    yield f"- {name}: {_protocol(row)}."
+    for column, parts in row.absent.items():
+        yield f"- \\* {name}, {column}: without {parts}."
+
+
+def _protocol(row: Row) -> str:
+    """Describe the protocol of an evaluated policy."""
+    trials = "trial" if row.trials == "1" else "trials"
+    left_out = f"; {row.left_out:,} episodes without a result are left out" if row.left_out else ""
+    return (
+        f"{row.tasks_run['total']:,} tasks; {row.trials} {trials} per task; prompt {row.prompt}; step limits "
+        f"{row.step_limits}; run by {row.program}{left_out}"
+    )
+
+
+def csv_text(table: Mapping[str, Any]) -> str:
+    """Return the table as CSV, one line for each model; cells that were not measured are empty."""
+    output = io.StringIO()
+    writer = csv.writer(output, lineterminator="\n")
+    named = {heading: heading.replace(" ", "_") for heading in COLUMNS}
+    counted = (*DIMENSIONS, "total")
+    writer.writerow(
+        [
+            *MARKS[".csv"].split(","),
+            "trials_per_task",
+            "episodes_left_out",
+            *named.values(),
+            *(f"{name}_tasks_run" for name in counted),
+            *(f"{name}_{bound}" for name in named.values() for bound in ("low", "high")),
+            "left_out_parts",
+        ]
+    )
+    for row in rows_of(table):
+        bounds: list[str] = []
+        for heading in COLUMNS:
+            bounds += row.intervals.get(heading, ("", ""))
+        writer.writerow(
+            [
+                row.name,
+                "yes" if row.published else "no",
+                row.program,
+                row.prompt,
+                row.step_limits,
+                row.trials,
+                row.left_out,
+                *(row.rates[heading] or "" for heading in COLUMNS),
+                *(row.tasks_run[name] for name in counted),
+                *bounds,
+                "; ".join(f"{column}: {parts}" for column, parts in row.absent.items()),
+            ]
+        )
+    return output.getvalue()
+
+
+def latex(table: Mapping[str, Any]) -> str:
+    """Return a LaTeX row of each evaluated policy, for a ``tabular`` with ten columns; comments state the protocol."""
+    lines = [MARKS[".tex"]]
+    for row in rows_of(table):
+        if row.published:
+            continue
+        cells = [_starred(row, heading, "$^{*}$") or "--" for heading in COLUMNS]
+        name = "".join(LATEX.get(character, character) for character in " ".join(row.name.split()))
+        lines.append(f"% {_protocol(row)}")
+        lines += [f"% * {column}: without {parts}" for column, parts in row.absent.items()]
+        lines.append(f"{' & '.join([name, *cells])} \\\\")
+    return "\n".join(lines) + "\n"
+
+
+def write_table(table: Mapping[str, Any], path: Path) -> list[Path]:
+    """Write the table as Markdown, CSV and LaTeX.
+
+    Args:
+        path: path of the three files without their suffix.
+
+    Returns:
+        The three files.
+
+    Raises:
+        PipelineError: if a file would overwrite a file of another origin.
+    """
+    refuse_other_tables(path)
+    texts = {".md": markdown(table), ".csv": csv_text(table), ".tex": latex(table)}
+    written = []
+    for suffix, text in texts.items():
+        file = path.with_name(path.name + suffix)
+        write(file, text)
+        written.append(file)
+    return written
+
+
+def refuse_other_tables(path: Path) -> None:
+    """Reject files that ``write_table`` would overwrite but has not written.
+
+    Args:
+        path: path of the three files without their suffix.
+
+    Raises:
+        PipelineError: if a file is rejected; it names the file.
+    """
+    for suffix, mark in MARKS.items():
+        refuse_other_file(path.with_name(path.name + suffix), mark)
