@@ -1,9 +1,10 @@
 """``schemas/episode.json`` as a typed object, and the check of an episode against it."""
 
 import io
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import Literal, Self
+from itertools import pairwise
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +120,7 @@ class EpisodeSchema(Frozen):
 
     Attributes:
         provenance: name of each provenance column, as in the manifest, to its type.
+        labels: name of each list of an episode's texts and their places, as in the manifest, to the type of its values.
     """
 
     fps_hz: int
@@ -137,6 +139,7 @@ class EpisodeSchema(Frozen):
     action: ActionSpec
     action_absolute: StateSpec
     provenance: dict[str, Literal["string", "int64", "float32"]]
+    labels: dict[str, Literal["string", "int64"]]
 
 
 SCHEMA = EpisodeSchema.model_validate_json(schema_file("episode.json").read_text())
@@ -158,6 +161,38 @@ def provenance_of(extras: Collection[Extra]) -> dict[str, str]:
     """Return the names of the provenance columns of episodes with these extras, to their types."""
     outcome = OUTCOME if "outcome" in extras else {}
     return {**SCHEMA.provenance, **outcome}
+
+
+def labels_of(episode: Episode) -> dict[str, list[Any]]:
+    """Return the lists of ``SCHEMA.labels``: the subtasks of an episode and the rewrites of its instruction."""
+    return {
+        "subtask_starts": [subtask.step for subtask in episode.subtasks],
+        "subtask_texts": [subtask.text for subtask in episode.subtasks],
+        "rewrites": list(episode.rewrites),
+    }
+
+
+def label_faults(labels: Mapping[str, Sequence[Any]], steps: int) -> Iterator[tuple[str, str]]:
+    """Yield each fault of an episode's labels, and the expected content.
+
+    Args:
+        labels: the lists of ``SCHEMA.labels``.
+        steps: number of the episode's steps.
+    """
+    starts, texts, rewrites = (labels[name] for name in ("subtask_starts", "subtask_texts", "rewrites"))
+    if len(starts) != len(texts):
+        yield f"{len(starts)} subtask_starts and {len(texts)} subtask_texts", "a text for each start"
+    if starts and starts[0] != 0:
+        yield f"the first of subtask_starts is {starts[0]}", "0"
+    if any(later <= earlier for earlier, later in pairwise(starts)):
+        yield f"subtask_starts {list(starts)} are not in order", "each start after the one before it"
+    if starts and max(starts) >= steps:
+        yield f"subtask_starts {list(starts)} leave the episode", f"starts below {steps}, the number of steps"
+    for text in (*texts, *rewrites):
+        if not text.strip() or "\n" in text:
+            yield f"the label {text!r}", "words in one line"
+    if len({*rewrites}) != len(rewrites):
+        yield f"{len(rewrites)} rewrites, of which some are equal", "each text once"
 
 
 def named(extras: Collection[Extra]) -> bool:
@@ -184,6 +219,8 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     if episode.action.min() < low or episode.action.max() > high:
         span = f"spans [{episode.action.min():g}, {episode.action.max():g}]"
         raise _fault(episode, "action", span, f"[{low:g}, {high:g}], as the controller clips it")
+    for what, expected in label_faults(labels_of(episode), steps):
+        raise _fault(episode, "labels", f"have a fault: {what}", expected)
     _check_frames(episode, steps)
     _check_geometry(episode, steps, extras)
     if not episode.instruction.strip() or "_" in episode.instruction:

@@ -270,6 +270,13 @@ class Geometry:
     maps: Mapping[Extra, Sequence[bytes]] = field(default_factory=dict)
 
 
+class Subtask(NamedTuple):
+    """Description of the current subtask in plain words, valid from the moment before the action ``step``."""
+
+    step: int
+    text: str
+
+
 @dataclass(frozen=True)
 class Rendered:
     """Everything that a policy may observe of one trajectory.
@@ -283,6 +290,7 @@ class Rendered:
         object_poses: (K, 24, 7) float32, ``None`` if not requested.
         instances: names of the objects that segmentation and poses number; empty without these extras.
         quality: quality measures of the trajectory.
+        subtasks: subtasks of the trajectory in their order.
     """
 
     replay_mode: str
@@ -296,13 +304,7 @@ class Rendered:
     object_poses: NDArray[np.float32] | None = None
     instances: Sequence[str] = ()
     quality: Quality | None = None
-
-
-class Subtask(NamedTuple):
-    """Description of the current subtask in plain words, valid from the moment before the action ``step``."""
-
-    step: int
-    text: str
+    subtasks: Sequence[Subtask] = ()
 
 
 @dataclass(frozen=True)
@@ -317,8 +319,8 @@ class Episode:
         provenance: the columns named in ``schemas/episode.json``.
         geometry: view name to its camera matrices and maps.
         object_poses, instances: as in ``Rendered``.
-        rewrites: other wordings of its task, for training; empty if not requested.
-        subtasks: its subtasks in their order; empty if not requested.
+        rewrites: other wordings of its task, for training.
+        subtasks: its subtasks in their order; empty if the trajectory manipulates nothing that the goal names.
     """
 
     episode_id: str

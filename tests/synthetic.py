@@ -24,12 +24,17 @@ from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export
-from pipeline.types import Episode, Extra, Geometry, Jpeg
+from pipeline.types import Episode, Extra, Geometry, Jpeg, Subtask
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
 SET = f"{NAME}_spatial"
 REPO = NAME
+
+REWRITES = ("kindly put the bowl on the plate", "the plate is where the bowl goes")
+SUBTASKS = (Subtask(0, "approach the bowl"), Subtask(5, "grasp the bowl"), Subtask(10, "move the bowl to the plate"))
+WITHOUT_LABELS = IDS[0]
+"""Episode without subtasks and rewrites, the first of its files."""
 
 MATRICES = {"intrinsics": (3, 3), "extrinsics": (4, 4)}
 EXTRAS: tuple[Extra, ...] = ("depth", "segmentation", "object_poses")
@@ -72,6 +77,8 @@ def episode(episode_id: str) -> Episode:
         instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
         provenance=provenance | {"episode_id": episode_id},
         geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
+        rewrites=() if episode_id == WITHOUT_LABELS else REWRITES,
+        subtasks=() if episode_id == WITHOUT_LABELS else SUBTASKS,
     )
 
 

@@ -135,8 +135,6 @@ class Format(ABC, Generic[Options]):
     """Packages that compute the bytes of the files."""
     group: ClassVar[str]
     """Name of the format that is written by the same stage, ``export_<group>``; most often the format's own name."""
-    rewrites_instructions: ClassVar[bool] = False
-    """True if the format can store rewrites of instructions, which depend on the plan's language axis."""
     splits_each_suite: ClassVar[bool] = False
     """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
     step_s: ClassVar[float]
@@ -170,11 +168,6 @@ class Format(ABC, Generic[Options]):
     def root(self) -> Path:
         """Return the folder that a client opens."""
         return self.folder
-
-    @property
-    def language(self) -> bool:
-        """Return whether the format stores an episode's rewrites and subtasks."""
-        return False
 
     @property
     def record_file(self) -> Path:

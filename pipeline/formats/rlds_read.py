@@ -13,7 +13,7 @@ from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named, provenance_of
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
-from pipeline.formats.read_back import Copy, Fault, in_both_splits, unlike
+from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of, unlike
 from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.rlds_write import texts as rlds_texts
@@ -206,6 +206,11 @@ def _said(value: Any) -> str | int | float:
     return value.decode() if isinstance(value, bytes) else value.item()
 
 
+def _labels(steps: Mapping[str, Any], name: str) -> list[Any]:
+    values = steps[METADATA + name].tolist()
+    return [text.decode() for text in values] if SCHEMA.labels[name] == "string" else values
+
+
 def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> Copy:
     shard, index = place
     instructions = [text.decode() for text in steps["language_instruction"]]
@@ -222,6 +227,8 @@ def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> 
         geometry={view: _geometry(steps, view, extras) for view in SCHEMA.views},
         object_poses=steps["observation/object_poses"] if "object_poses" in extras else None,
         instances=json.loads(steps[f"{METADATA}instances"][0]) if named(extras) else (),
+        rewrites=_labels(steps, "rewrites"),
+        subtasks=subtasks_of(_labels(steps, "subtask_starts"), _labels(steps, "subtask_texts")),
     )
     return Copy(
         dataset="rlds",

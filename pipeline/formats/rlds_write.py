@@ -1,8 +1,8 @@
 """Writer of shards and metadata of RLDS sets, without TensorFlow.
 
 Feature names, shapes and dtypes are those of OpenVLA's ``libero_*_no_noops`` sets (hub:
-``openvla/modified_libero_rlds``). Provenance and the cameras' matrices are added to ``episode_metadata``, extras to
-``observation``; the loaders ignore these additions.
+``openvla/modified_libero_rlds``). Provenance, labels and the cameras' matrices are added to ``episode_metadata``,
+extras to ``observation``; the loaders ignore these additions.
 """
 
 import json
@@ -15,7 +15,18 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MapSpec, MatrixSpec, VectorSpec, check, named, provenance_of
+from pipeline.episode_schema import (
+    MAPS,
+    MATRICES,
+    SCHEMA,
+    MapSpec,
+    MatrixSpec,
+    VectorSpec,
+    check,
+    labels_of,
+    named,
+    provenance_of,
+)
 from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
@@ -125,6 +136,9 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     metadata |= {f"{view}_{name}": _tensor(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
     if named(extras):
         metadata["instances"] = tfds.features.Text(doc="JSON list of names; segmentation and poses have places in it")
+    for key, dtype in SCHEMA.labels.items():
+        value = tfds.features.Text() if dtype == "string" else scalar(np.dtype(dtype))
+        metadata[key] = tfds.features.Sequence(value, doc=meanings[key])
     return tfds.features.FeaturesDict({"steps": tfds.features.Dataset(step), "episode_metadata": metadata})
 
 
@@ -174,4 +188,5 @@ def _nested_example(episode: Episode) -> dict[str, Any]:
         metadata |= {f"{view}_{name}": getattr(geometry, name) for name in MATRICES}
     if episode.instances:
         metadata["instances"] = json.dumps(list(episode.instances))
+    metadata |= labels_of(episode)
     return {"steps": steps, "episode_metadata": metadata}

@@ -128,7 +128,7 @@ class Run:
         self, extras: tuple[Extra, ...] = (), rewrites: Mapping[str, Sequence[str]] | None = None
     ) -> EpisodeLoader:
         """Return the loader of rendered episodes; for ``extras`` and ``rewrites`` see ``EpisodeLoader``."""
-        return EpisodeLoader(self.folder, self.config.render, extras, rewrites)
+        return EpisodeLoader(self.folder, self.config.render, extras, rewrites or {})
 
     def workers(self, *, renders: bool = False) -> AbstractContextManager[Workers]:
         """Start the workers of the section ``compute``, which stop when the context ends."""

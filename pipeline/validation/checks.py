@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
-from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, label_faults, labels_of
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
@@ -143,6 +143,20 @@ def _language_entries(case: Case, train: bool) -> list[tuple[str, str, str, np.f
     for subtask in case.made.subtasks:
         entries.append(("assistant", "subtask", subtask.text, np.float32(subtask.step / SCHEMA.fps_hz)))
     return entries
+
+
+def labels(case: Case) -> Iterator[Fault]:
+    """Check the subtasks and rewrites of the manifest, and compare all copies with the manifest."""
+    stated = {name: case.row[name] for name in SCHEMA.labels}
+    if None in stated.values():
+        yield case.finding("manifest", "has no subtasks and rewrites", "lists, which may be empty")
+        return
+    for what, expected in label_faults(stated, len(case.made)):
+        yield case.finding("manifest", what, expected)
+    for dataset, episode in (("frames", case.made), *((copy.dataset, copy.episode) for copy in case.copies)):
+        for name, stored in labels_of(episode).items():
+            if stored != stated[name]:
+                yield case.finding(dataset, f"{name} is {stored}", stated[name])
 
 
 def wording(case: Case) -> Iterator[Fault]:
@@ -332,6 +346,6 @@ def _listed(place: Mapping[str, Any]) -> str:
 
 Check = Callable[[Case], Iterable[Fault]]
 
-_EVERY = (length, motion, instruction, wording, provenance, place, jpeg, geometry, video, cameras, alive, gripper)
-CHECKS: Mapping[str, Check] = {check.__name__: check for check in (*_EVERY, flags, clock, statistics)}
+_EVERY = (length, motion, instruction, labels, wording, provenance, place, jpeg, geometry, video, cameras, alive)
+CHECKS: Mapping[str, Check] = {check.__name__: check for check in (*_EVERY, gripper, flags, clock, statistics)}
 """Name to check."""

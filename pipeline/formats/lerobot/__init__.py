@@ -70,10 +70,9 @@ class LeRobot(Format[LeRobotConfig]):
     title: ClassVar = "LeRobot"
     options_type: ClassVar = LeRobotConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 9
+    recipe: ClassVar = 10
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = "lerobot"
-    rewrites_instructions: ClassVar = True
     step_s: ClassVar = 0.0015
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
@@ -91,12 +90,8 @@ class LeRobot(Format[LeRobotConfig]):
         self.keys = {**LeRobot.keys, **self._convention.motion_keys}
 
     @property
-    def language(self) -> bool:
-        return self.options.language
-
-    @property
     def _convention(self) -> Convention:
-        return Convention(self.options.frames, language=self.language, action=self.options.action)
+        return Convention(self.options.frames, language=self.options.language, action=self.options.action)
 
     @property
     def root(self) -> Path:
@@ -239,7 +234,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     name: ClassVar = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
     options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
-    recipe: ClassVar = 4
+    recipe: ClassVar = 5
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = LeRobot.group
     step_s: ClassVar = LeRobot.step_s

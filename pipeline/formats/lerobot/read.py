@@ -30,7 +30,7 @@ from pipeline.formats.lerobot.columns import (
     matrix,
     video_path_v21,
 )
-from pipeline.formats.read_back import Copy, Statistics, sampled
+from pipeline.formats.read_back import Copy, Statistics, sampled, subtasks_of
 from pipeline.formats.stated_statistics import QUANTILES
 from pipeline.types import Episode, Extra, Frame, Geometry
 
@@ -195,7 +195,7 @@ def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
 def episode(
     table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...], convention: Convention
 ) -> Episode:
-    """Return an episode, given v3.0's columns of its steps and its row of ``meta/provenance.parquet``.
+    """Return an episode, given v3.0's columns of its steps and its row of the files in ``meta/``.
 
     The episode has frames only where they are stored as image files.
     """
@@ -216,6 +216,8 @@ def episode(
         geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},
         object_poses=_object_poses(table) if "object_poses" in extras else None,
         instances=json.loads(row[INSTANCES]) if named(extras) else (),
+        rewrites=row["rewrites"],
+        subtasks=subtasks_of(row["subtask_starts"], row["subtask_texts"]),
     )
 
 

@@ -33,7 +33,7 @@ import pyarrow.parquet as pq
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MATRICES, SCHEMA, check, named, provenance_of
+from pipeline.episode_schema import MATRICES, SCHEMA, check, labels_of, named, provenance_of
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, listed, of_levels, open_is_one
@@ -426,7 +426,13 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, ex
                 row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
             rows.append(row)
             made.append((_provenance_row(episode, index), levels))
-    pq.write_table(pa.Table.from_pylist(rows), path / EPISODES)
+    table = pa.Table.from_pylist(rows)
+    # An empty list has no type of its own, and lerobot reads all files as one table.
+    for name, dtype in SCHEMA.labels.items():
+        place = table.schema.get_field_index(name)
+        values = pa.array(table[name].to_pylist(), pa.list_(pa.type_for_alias(dtype)))
+        table = table.set_column(place, name, values)
+    pq.write_table(table, path / EPISODES)
     _write_summary(path, made, extras)
 
 
@@ -478,6 +484,7 @@ def _episode_row(episode: Episode, piece: Piece, index: int, first_step: int, fr
         "meta/episodes/chunk_index": chunk,
         "meta/episodes/file_index": file,
     }
+    row |= labels_of(episode)
     before = first_step - piece.first_step
     for view in SCHEMA.views.values() if frames == "video" else ():
         row |= {
@@ -510,7 +517,8 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
             for name, all_figures in _episode_statistics(numbers, levels).items():
                 figures[convention.name(name)] = listed({figure: all_figures[figure] for figure in STATISTICS_V21})
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
-            episodes.write(json.dumps(row | {"episode_id": episode.episode_id}) + "\n")
+            row |= {"episode_id": episode.episode_id, **labels_of(episode)}
+            episodes.write(json.dumps(row) + "\n")
             stats.write(json.dumps({"episode_index": index, "stats": figures}) + "\n")
             made.append((_provenance_row(episode, index), levels))
     _write_summary(path, made, extras)
