@@ -31,7 +31,7 @@ def column(name: str, values: pa.DataType, meaning: str) -> pa.Field:
 
 
 def columns_of(record: type[Any]) -> list[pa.Field]:
-    """Return a column for each field of a dataclass of ``Annotated[type, meaning]``; a type may be optional or a list."""
+    """Return a column for each field of a dataclass of ``Annotated[type, meaning]``; it may be optional or a list."""
     hints = get_type_hints(record, include_extras=True)
     columns = []
     for each in fields(record):
