@@ -125,7 +125,10 @@ def make_plan(run: Run) -> None:
         )
     plan.write(rows, run.plan_file)
     trajectories = len({row.trajectory_id for row in rows})
-    print(f"planned {sum(row.wanted for row in rows)} episodes from {trajectories} trajectories")
+    wanted = [row for row in rows if row.wanted]
+    sequences = len({row.trajectory_id for row in wanted})
+    print(f"planned {len(wanted)} episodes from {trajectories} trajectories")
+    print(f"the episodes have at most {sequences} distinct action sequences, as many as they have trajectories")
 
 
 def check_leakage(run: Run) -> None:
@@ -283,6 +286,7 @@ def summarize(run: Run) -> None:
         _render_sheets(run)
         memory.keep()
     Console().print(counts.shown(rows, episodes))
+    print(counts.Diversity.of(rows))
     for sentence in (*counts.shortfalls(counts.targets(rows, episodes)), *counts.beyond_step_limit(rows)):
         print(sentence)
 

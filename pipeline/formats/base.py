@@ -143,7 +143,8 @@ class Format(ABC, Generic[Options]):
     """Columns of the manifest with the place of an episode; null when it was dropped."""
     keys: Mapping[str, str]
     """Names in this format of each view, of ``state``, ``joint_state`` and ``action``, and of each view's matrices and
-    maps, such as ``image_depth``. ``provenance`` is the place of an episode's provenance, matrices and instances."""
+    maps, such as ``image_depth``. ``provenance`` is the place of an episode's provenance, matrices and instances;
+    ``labels`` is the place of its subtasks and rewrites."""
     clients: tuple[str, ...]
     """The clients of ``finetune.yaml`` that train on this format."""
     gripper: GripperSpec = SCHEMA.action.gripper
@@ -168,6 +169,11 @@ class Format(ABC, Generic[Options]):
     def root(self) -> Path:
         """Return the folder that a client opens."""
         return self.folder
+
+    @property
+    def language(self) -> bool:
+        """Return whether every frame has lerobot's language column."""
+        return False
 
     @property
     def record_file(self) -> Path:

@@ -62,7 +62,7 @@ class Rlds(Format[RldsConfig]):
     keys = (
         {name: name for name in (*SCHEMA.views, *MOTION)}
         | {f"{view}_{name}": f"{view}_{name}" for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
-        | {"provenance": "episode_metadata"}
+        | {"provenance": "episode_metadata", "labels": "episode_metadata"}
     )
     clients = ("openvla_oft",)
 

@@ -81,7 +81,7 @@ class LeRobot(Format[LeRobotConfig]):
         {view: spec.lerobot_key for view, spec in SCHEMA.views.items()}
         | Convention("video").motion_keys
         | {f"{view}_{name}": camera_column(view, name) for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
-        | {"provenance": "meta/provenance.parquet"}
+        | {"provenance": "meta/provenance.parquet", "labels": "meta/episodes"}
     )
     clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
 
@@ -90,8 +90,12 @@ class LeRobot(Format[LeRobotConfig]):
         self.keys = {**LeRobot.keys, **self._convention.motion_keys}
 
     @property
+    def language(self) -> bool:
+        return self.options.language
+
+    @property
     def _convention(self) -> Convention:
-        return Convention(self.options.frames, language=self.options.language, action=self.options.action)
+        return Convention(self.options.frames, language=self.language, action=self.options.action)
 
     @property
     def root(self) -> Path:
@@ -245,6 +249,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
         super().__init__(data, options, extras)
         self.convention = CONVENTIONS[options.convention]
         self.keys = {name: self.convention.name(key) for name, key in LeRobot.keys.items()}
+        self.keys["labels"] = "meta/episodes.jsonl"
         if self.convention.open_is_one:
             self.gripper = GripperSpec(open=1.0, close=0.0)
         self.clients = CLIENTS_V21[options.convention]
