@@ -272,7 +272,7 @@ def write_recipe(run: Run) -> None:
     from pipeline.clients import recipe
 
     export = run.config.export
-    built = recipe.build(run.manifest_file, run.manifest, export)
+    built = recipe.build(run.manifest_file, run.manifest, export, run.config.finetune.rewrite_probability)
     recipe.write(built, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
     file = run.path(FINETUNE) / RECIPE
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
@@ -358,7 +358,7 @@ STAGES = {
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
     "manifest": Stage(write_manifest, _LABELLED, (INPUTS, *_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
-    "recipe": Stage(write_recipe, ("export",), (MANIFEST, *_RECORDS), (FINETUNE,)),
+    "recipe": Stage(write_recipe, ("export", "finetune"), (MANIFEST, *_RECORDS), (FINETUNE,)),
     "summary": Stage(summarize),
     "card": Stage(write_card, ("export", "publish"), (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
     "report": Stage(write_report),
