@@ -209,8 +209,8 @@ class RenderConfig(Frozen):
     Attributes:
         encoding: File format of the frames; only ``jpeg`` exists.
         jpeg_quality: JPEG quality of the frames, 50 to 100; 95 by default.
-        extras: Further content of all datasets: ``depth`` and ``segmentation`` of both views, and ``object_poses``;
-            none by default.
+        extras: Further content of all datasets: ``depth``, ``segmentation`` and ``boxes`` of both views, and
+            ``object_poses``; none by default.
     """
 
     encoding: Literal["jpeg"] = "jpeg"

@@ -134,6 +134,7 @@ class EpisodeSchema(Frozen):
     depth: DepthSpec
     segmentation: MapSpec
     object_poses: PosesSpec
+    boxes: PosesSpec
     state: StateSpec
     joint_state: VectorSpec
     action: ActionSpec
@@ -197,7 +198,7 @@ def label_faults(labels: Mapping[str, Sequence[Any]], steps: int) -> Iterator[tu
 
 def named(extras: Collection[Extra]) -> bool:
     """Return whether episodes with these extras have a table of names."""
-    return bool({"segmentation", "object_poses"} & set(extras))
+    return bool({"segmentation", "object_poses", "boxes"} & set(extras))
 
 
 def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
@@ -279,13 +280,18 @@ def _check_geometry(episode: Episode, steps: int, extras: Collection[Extra]) -> 
         wanted = {name: steps for name in MAPS if name in extras}
         if lengths != wanted:
             raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each requested map")
+        if ("boxes" in extras) != (geometry.boxes is not None):
+            expected = "boxes if, and only if, render.extras lists them"
+            raise _fault(episode, f"{view} boxes", "are missing or not requested", expected)
+        if geometry.boxes is not None:
+            _check_array(episode, f"{view}_boxes", geometry.boxes, SCHEMA.boxes, steps)
     if ("object_poses" in extras) != (episode.object_poses is not None):
         expected = "poses if, and only if, render.extras lists them"
         raise _fault(episode, "object_poses", "are missing or not requested", expected)
     if episode.object_poses is not None:
         _check_array(episode, "object_poses", episode.object_poses, SCHEMA.object_poses, steps)
     if named(extras) != bool(episode.instances):
-        expected = "names if, and only if, render.extras lists segmentation or object_poses"
+        expected = "names if, and only if, render.extras lists segmentation, object_poses or boxes"
         raise _fault(episode, "instances", f"has {len(episode.instances)} names", expected)
 
 

@@ -45,7 +45,7 @@ RECIPES: dict[Step, int] = {
 """
 
 MAPS_RECIPE = 2
-"""Recipe of depth and segmentation; only the files of runs with these extras depend on it."""
+"""Recipe of depth, segmentation and boxes; only the files of runs with these extras depend on it."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),

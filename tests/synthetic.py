@@ -37,7 +37,7 @@ WITHOUT_LABELS = IDS[0]
 """Episode without subtasks and rewrites, the first of its files."""
 
 MATRICES = {"intrinsics": (3, 3), "extrinsics": (4, 4)}
-EXTRAS: tuple[Extra, ...] = ("depth", "segmentation", "object_poses")
+EXTRAS: tuple[Extra, ...] = ("depth", "segmentation", "object_poses", "boxes")
 
 Tree = dict[str, bytes]
 
@@ -91,7 +91,7 @@ def goals(state: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np
 
 @cache
 def with_extras(episode_id: str) -> Episode:
-    """Generate the episode of ``episode`` with depth, segmentation and poses."""
+    """Generate the episode of ``episode`` with depth, segmentation, poses and boxes."""
     source, rng = episode(episode_id), seeding.rng("test_writers", "extras", episode_id)
     steps = len(source)
 
@@ -103,9 +103,12 @@ def with_extras(episode_id: str) -> Episode:
             "segmentation": [cv2.imencode(".png", each)[1].tobytes() for each in small],
         }
 
+    def boxes() -> NDArray[np.float32]:
+        return rng.integers(0, 128, size=(steps, 24, 4)).astype(np.float32)
+
     return replace(
         source,
-        geometry={view: replace(seen, maps=maps()) for view, seen in source.geometry.items()},
+        geometry={view: replace(seen, maps=maps(), boxes=boxes()) for view, seen in source.geometry.items()},
         object_poses=rng.normal(size=(steps, 24, 7)).astype(np.float32),
         instances=("nothing", "robot", episode_id),
     )

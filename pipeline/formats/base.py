@@ -103,7 +103,7 @@ class StepSizes(NamedTuple):
     Attributes:
         frame_kb: one frame of one view.
         maps_kb: depth and segmentation of one view, as far as they are stored.
-        poses_kb: object poses, as far as they are stored.
+        poses_kb: object poses and boxes, as far as they are stored.
         motion_kb: state, action and all other columns except the frames.
     """
 

@@ -61,7 +61,7 @@ class Rlds(Format[RldsConfig]):
     )
     keys = (
         {name: name for name in (*SCHEMA.views, *MOTION)}
-        | {f"{view}_{name}": f"{view}_{name}" for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
+        | {f"{view}_{name}": f"{view}_{name}" for view in SCHEMA.views for name in (*MATRICES, *MAPS, "boxes")}
         | {"provenance": "episode_metadata", "labels": "episode_metadata"}
     )
     clients = ("openvla_oft",)

@@ -199,7 +199,8 @@ def _opened(info_file: Edition) -> Any:
 def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
     matrices = {name: steps[f"{METADATA}{view}_{name}"] for name in MATRICES}
     maps = {name: steps[f"observation/{view}_{name}"].tolist() for name in MAPS if name in extras}
-    return Geometry(**matrices, maps=maps)
+    boxes = steps[f"observation/{view}_boxes"] if "boxes" in extras else None
+    return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
 def _said(value: Any) -> str | int | float:

@@ -109,6 +109,8 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     for name in MAPS:
         if name in extras:
             observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
+    if "boxes" in extras:
+        observation |= {f"{view}_boxes": _tensor(SCHEMA.boxes) for view in SCHEMA.views}
     if "object_poses" in extras:
         observation["object_poses"] = _tensor(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
@@ -135,7 +137,7 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
         metadata[key] = tfds.features.Text(doc=doc) if dtype == "string" else scalar(np.dtype(dtype), doc=doc)
     metadata |= {f"{view}_{name}": _tensor(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
     if named(extras):
-        metadata["instances"] = tfds.features.Text(doc="JSON list of names; segmentation and poses have places in it")
+        metadata["instances"] = tfds.features.Text(doc="JSON list of names, whose places the extras use")
     for key, dtype in SCHEMA.labels.items():
         value = tfds.features.Text() if dtype == "string" else scalar(np.dtype(dtype))
         metadata[key] = tfds.features.Sequence(value, doc=meanings[key])
@@ -169,6 +171,8 @@ def _nested_example(episode: Episode) -> dict[str, Any]:
         columns["object_poses"] = episode.object_poses
     for view, geometry in episode.geometry.items():
         columns |= {f"{view}_{name}": files for name, files in geometry.maps.items()}
+        if geometry.boxes is not None:
+            columns[f"{view}_boxes"] = geometry.boxes
     steps = []
     for t in range(len(episode)):
         step = {

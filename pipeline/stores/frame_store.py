@@ -24,7 +24,7 @@ from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import SUFFIX, Store
 from pipeline.types import Geometry, Jpeg, Quality, Rendered, Subtask
 
-_OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
+_OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses", "boxes"}
 """Parts of the schema that describe the content of a store's files."""
 
 
@@ -72,7 +72,7 @@ class FrameStore(Store):
 
     def __init__(self, root: Path, render_config: RenderConfig):
         schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*render_config.extras} else {}
+        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS, "boxes"} & {*render_config.extras} else {}
         super().__init__(root, render_config.model_dump(mode="json"), {"episode schema": schema, **maps})
 
     @staticmethod
@@ -113,6 +113,8 @@ class FrameStore(Store):
             arrays |= {f"{view}/{name}": getattr(geometry, name) for name in MATRICES}
             for extra, files in geometry.maps.items():
                 arrays |= _packed(f"{view}/{extra}", files)
+            if geometry.boxes is not None:
+                arrays[f"{view}/boxes"] = geometry.boxes
         if rendered.object_poses is not None:
             arrays["object_poses"] = rendered.object_poses
         self.write(file_name(trajectory_id, {*rendered.streams, *rendered.rejected}), arrays, attributes)
@@ -276,7 +278,8 @@ def _packed(parent: str, files: Sequence[bytes]) -> dict[str, NDArray[Any]]:
 def _geometry(file: SealedFile, view: str) -> Geometry:
     matrices = {name: file.array(f"{view}/{name}") for name in MATRICES}
     maps = {name: _unpacked(file, f"{view}/{name}") for name in MAPS if f"{view}/{name}/bytes" in file.checksums}
-    return Geometry(**matrices, maps=maps)
+    boxes = file.array(f"{view}/boxes") if f"{view}/boxes" in file.checksums else None
+    return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
 def _unpacked(file: SealedFile, parent: str) -> list[bytes]:

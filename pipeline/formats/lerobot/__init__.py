@@ -80,7 +80,7 @@ class LeRobot(Format[LeRobotConfig]):
     keys = (
         {view: spec.lerobot_key for view, spec in SCHEMA.views.items()}
         | Convention("video").motion_keys
-        | {f"{view}_{name}": camera_column(view, name) for view in SCHEMA.views for name in (*MATRICES, *MAPS)}
+        | {f"{view}_{name}": camera_column(view, name) for view in SCHEMA.views for name in (*MATRICES, *MAPS, "boxes")}
         | {"provenance": "meta/provenance.parquet", "labels": "meta/episodes"}
     )
     clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")

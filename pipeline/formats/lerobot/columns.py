@@ -101,9 +101,10 @@ def video_path_v21(index: int, key: str) -> str:
 
 
 def camera_column(view: str, name: str) -> str:
-    """Return the column with a view's matrix or map.
+    """Return the column with a view's matrix, map or boxes.
 
-    A matrix is stored row by row in ``meta/provenance.parquet``, a map as PNG in base64 in every frame. Maps are text,
+    A matrix is stored row by row in ``meta/provenance.parquet``, a map as PNG in base64 in every frame, and boxes as
+    numbers, row by row, in every frame. Maps are text,
     and no name begins with ``observation``, because lerobot's policies use such columns and all images as inputs.
     """
     return f"{SCHEMA.views[view].lerobot_camera}.{name}"
@@ -189,6 +190,8 @@ class Convention:
         columns[EPISODE_ID] = dict(text)
         maps = [name for name in MAPS if name in extras]
         columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in maps}
+        if "boxes" in extras:
+            columns |= {camera_column(view, "boxes"): _flat(SCHEMA.boxes) for view in SCHEMA.views}
         if "object_poses" in extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
         if self.language:

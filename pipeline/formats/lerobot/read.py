@@ -250,7 +250,10 @@ def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[
         matrices[name] = numbers.reshape(getattr(SCHEMA, name).shape)
     texts = {name: table[camera_column(view, name)].to_pylist() for name in MAPS if name in extras}
     maps = {name: list(map(base64.b64decode, files)) for name, files in texts.items()}
-    return Geometry(**matrices, maps=maps)
+    boxes = None
+    if "boxes" in extras:
+        boxes = matrix(table, camera_column(view, "boxes")).reshape(-1, *SCHEMA.boxes.shape)
+    return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
 def decoded(times_s: Sequence[float], videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:

@@ -209,6 +209,9 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, conven
     numbers: dict[str, NDArray[Any]] = {key: getattr(episode, name) for name, key in convention.motion_keys.items()}
     if episode.object_poses is not None:
         numbers[OBJECT_POSES] = episode.object_poses.reshape(len(steps), -1)
+    for view, geometry in episode.geometry.items():
+        if geometry.boxes is not None:
+            numbers[camera_column(view, "boxes")] = geometry.boxes.reshape(len(steps), -1)
     return numbers | {
         "timestamp": (steps / SCHEMA.fps_hz).astype(np.float32),
         "frame_index": steps,
