@@ -23,6 +23,10 @@ def main(run: Path) -> None:
         delta_timestamps={"action": [step / FPS_HZ for step in range(CHUNK)]},
     )
     print(f"{root.name}: {dataset.num_episodes} episodes, {dataset.num_frames} frames at {dataset.fps} Hz")
+    labels = dataset.meta.episodes[0]
+    for start, text in zip(labels["subtask_starts"], labels["subtask_texts"], strict=True):
+        print(f"  episode 0, from step {start}: {text}")
+    print(f"  episode 0 has {len(labels['rewrites'])} rewrites of its instruction")
     batch = next(iter(DataLoader(dataset, batch_size=4, shuffle=True)))
     for name in ("observation.images.image", "observation.images.image2", "observation.state", "action"):
         print(f"  {name}: {tuple(batch[name].shape)}")  # images are (N, 3, 256, 256), from 0 to 1

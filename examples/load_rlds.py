@@ -36,6 +36,9 @@ def show(episode: Mapping[str, Any]) -> None:
     print(f"  first episode: {episode_id}, {axis} of level {level}")
     print(f"  instruction: {steps[0]['language_instruction'].decode()}")
     print(f"  actions: {actions.shape}")
+    for start, text in zip(metadata["subtask_starts"], metadata["subtask_texts"], strict=True):
+        print(f"  from step {start}: {text.decode()}")
+    print(f"  rewrites: {len(metadata['rewrites'])}")
     for name, value in steps[0]["observation"].items():
         print(f"  {name}: {value.shape} {value.dtype}")
     for view in ("image", "wrist_image"):

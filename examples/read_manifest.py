@@ -21,6 +21,11 @@ def main(run: Path) -> None:
     perturbations = kept.perturbations.map(json.loads)
     print(f"parameters of one episode: {perturbations[perturbations.str.len() > 0].iloc[0]}")
 
+    first = kept.iloc[0]
+    for start, text in zip(first.subtask_starts, first.subtask_texts, strict=True):
+        print(f"{first.episode_id}, from step {start}: {text}")
+    print(f"{len(kept)} episodes have {kept.actions_sha256.nunique()} distinct action sequences")
+
     # Pairs for a comparison: a perturbed episode and the clean episode of its demonstration.
     pairs = kept[kept.role == "perturbed"].merge(kept, left_on="twin_id", right_on="episode_id", suffixes=("", "_twin"))
     index = "lerobot_episode_index"

@@ -224,8 +224,8 @@ class RenderConfig(Frozen):
             ``sideview`` and ``galleryview``; none by default. The axes camera and noise leave them unchanged.
         encoding: File format of the frames; only ``jpeg`` exists.
         jpeg_quality: JPEG quality of the frames, 50 to 100; 95 by default.
-        extras: Further content of all datasets: ``depth`` and ``segmentation`` of all views, and ``object_poses``;
-            none by default.
+        extras: Further content of all datasets: ``depth``, ``segmentation`` and ``boxes`` of all views, and
+            ``object_poses``; none by default.
     """
 
     # The defaults are left out, so that earlier frames and datasets stay up to date.
@@ -245,6 +245,17 @@ class RenderConfig(Frozen):
         return Content((*SCHEMA.views, *further_views), self.size_px, self.extras)
 
 
+class FinetuneConfig(Frozen):
+    """Options of the fine-tuning recipe.
+
+    Attributes:
+        rewrite_probability: Probability, 0 to 1, with which OpenVLA-OFT's script replaces the instruction of a training
+            sample by one of the episode's rewrites; 0 by default, as in the paper.
+    """
+
+    rewrite_probability: float = Field(default=0.0, ge=0.0, le=1.0)
+
+
 class Config(Frozen):
     """Configuration of a whole run.
 
@@ -258,6 +269,7 @@ class Config(Frozen):
         filter: Limits of the quality of successful replays; none by default.
         render: Options of rendering.
         export: Output formats and their options; by default RLDS and LeRobot.
+        finetune: Options of the fine-tuning recipe.
         compute: Place of the computation; by default all cores of this machine.
         publish: Statements of the dataset card; none by default.
     """
@@ -271,6 +283,8 @@ class Config(Frozen):
     filter: FilterConfig = Field(default=FilterConfig(), exclude_if=lambda limits: limits == FilterConfig())
     render: RenderConfig = RenderConfig()
     export: ExportConfig = Field(default=ExportConfig(), validate_default=True)
+    # Excluded at its default, as a section that was added later.
+    finetune: FinetuneConfig = Field(default=FinetuneConfig(), exclude_if=lambda section: section == FinetuneConfig())
     compute: ComputeConfig = ComputeConfig()
     publish: PublishConfig = PublishConfig()
 

@@ -1,10 +1,11 @@
 """``schemas/episode.json`` as a typed object, and the check of an episode against it."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, Self
+from itertools import pairwise
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,6 +124,7 @@ class EpisodeSchema(Frozen):
         further_views: the same of the views that a run has on request.
         frame: storage of frames of the default size.
         provenance: name of each provenance column, as in the manifest, to its type.
+        labels: name of each list of an episode's texts and their places, as in the manifest, to the type of its values.
     """
 
     fps_hz: int
@@ -137,11 +139,13 @@ class EpisodeSchema(Frozen):
     depth: DepthSpec
     segmentation: MapSpec
     object_poses: PosesSpec
+    boxes: PosesSpec
     state: StateSpec
     joint_state: VectorSpec
     action: ActionSpec
     action_absolute: StateSpec
     provenance: dict[str, Literal["string", "int64", "float32"]]
+    labels: dict[str, Literal["string", "int64"]]
 
 
 SCHEMA = EpisodeSchema.model_validate_json(schema_file("episode.json").read_text())
@@ -207,7 +211,7 @@ class Content:
     @property
     def has_names(self) -> bool:
         """Return whether the episodes have a table of names."""
-        return bool({"segmentation", "object_poses"} & set(self.extras))
+        return bool({"segmentation", "object_poses", "boxes"} & set(self.extras))
 
     def including(self, extra: Extra) -> "Content":
         """Return the content with one more extra."""
@@ -217,6 +221,38 @@ class Content:
         """Return the parts of a dataset's identity; parts with default values are left out, as in earlier versions."""
         is_standard = (self.views, self.size_px) == (Content.views, Content.size_px)
         return [self.extras] if is_standard else [self.extras, self.views, self.size_px]
+
+
+def labels_of(episode: Episode) -> dict[str, list[Any]]:
+    """Return the lists of ``SCHEMA.labels``: the subtasks of an episode and the rewrites of its instruction."""
+    return {
+        "subtask_starts": [subtask.step for subtask in episode.subtasks],
+        "subtask_texts": [subtask.text for subtask in episode.subtasks],
+        "rewrites": list(episode.rewrites),
+    }
+
+
+def label_faults(labels: Mapping[str, Sequence[Any]], steps: int) -> Iterator[tuple[str, str]]:
+    """Yield each fault of an episode's labels, and the expected content.
+
+    Args:
+        labels: the lists of ``SCHEMA.labels``.
+        steps: number of the episode's steps.
+    """
+    starts, texts, rewrites = (labels[name] for name in ("subtask_starts", "subtask_texts", "rewrites"))
+    if len(starts) != len(texts):
+        yield f"{len(starts)} subtask_starts and {len(texts)} subtask_texts", "a text for each start"
+    if starts and starts[0] != 0:
+        yield f"the first of subtask_starts is {starts[0]}", "0"
+    if any(later <= earlier for earlier, later in pairwise(starts)):
+        yield f"subtask_starts {list(starts)} are not in order", "each start after the one before it"
+    if starts and max(starts) >= steps:
+        yield f"subtask_starts {list(starts)} leave the episode", f"starts below {steps}, the number of steps"
+    for text in (*texts, *rewrites):
+        if not text.strip() or "\n" in text:
+            yield f"the label {text!r}", "words in one line"
+    if len({*rewrites}) != len(rewrites):
+        yield f"{len(rewrites)} rewrites, of which some are equal", "each text once"
 
 
 STANDARD = Content()
@@ -242,6 +278,8 @@ def check(episode: Episode, content: Content = STANDARD) -> None:
     if episode.action.min() < low or episode.action.max() > high:
         span = f"spans [{episode.action.min():g}, {episode.action.max():g}]"
         raise _fault(episode, "action", span, f"[{low:g}, {high:g}], as the controller clips it")
+    for what, expected in label_faults(labels_of(episode), steps):
+        raise _fault(episode, "labels", f"have a fault: {what}", expected)
     _check_frames(episode, steps, content)
     _check_geometry(episode, steps, content)
     if not episode.instruction.strip() or "_" in episode.instruction:
@@ -299,13 +337,18 @@ def _check_geometry(episode: Episode, steps: int, content: Content) -> None:
         wanted = dict.fromkeys(content.maps, steps)
         if lengths != wanted:
             raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each requested map")
+        if ("boxes" in content.extras) != (geometry.boxes is not None):
+            expected = "boxes if, and only if, render.extras lists them"
+            raise _fault(episode, f"{view} boxes", "are missing or not requested", expected)
+        if geometry.boxes is not None:
+            _check_array(episode, f"{view}_boxes", geometry.boxes, SCHEMA.boxes, steps)
     if ("object_poses" in content.extras) != (episode.object_poses is not None):
         expected = "poses if, and only if, render.extras lists them"
         raise _fault(episode, "object_poses", "are missing or not requested", expected)
     if episode.object_poses is not None:
         _check_array(episode, "object_poses", episode.object_poses, SCHEMA.object_poses, steps)
     if content.has_names != bool(episode.instances):
-        expected = "names if, and only if, render.extras lists segmentation or object_poses"
+        expected = "names if, and only if, render.extras lists segmentation, object_poses or boxes"
         raise _fault(episode, "instances", f"has {len(episode.instances)} names", expected)
 
 

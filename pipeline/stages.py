@@ -125,7 +125,10 @@ def make_plan(run: Run) -> None:
         )
     plan.write(rows, run.plan_file)
     trajectories = len({row.trajectory_id for row in rows})
-    print(f"planned {sum(row.wanted for row in rows)} episodes from {trajectories} trajectories")
+    wanted = [row for row in rows if row.wanted]
+    sequences = len({row.trajectory_id for row in wanted})
+    print(f"planned {len(wanted)} episodes from {trajectories} trajectories")
+    print(f"the episodes have at most {sequences} distinct action sequences, as many as they have trajectories")
 
 
 def check_leakage(run: Run) -> None:
@@ -210,18 +213,20 @@ def _export(group: str) -> Stage:
         return next(filter(None, map(export.changed_file, datasets)), None)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
-    settings, files = [*_EXPORT], [*_OUTCOME]
-    if any(kind.rewrites_instructions for kind in kinds):
-        # The rewrites of a task depend on the plan's language axis and on the user's own bank.
-        settings, files = [*_EXPORT, "plan"], [INPUTS, *_OUTCOME]
     records_of_failures = [f"{FAILURES}/{record}" for record in records]
-    return Stage(write_datasets, settings, files, (*records, *records_of_failures), changed_file)
+    return Stage(write_datasets, _LABELLED, (INPUTS, *_OUTCOME), (*records, *records_of_failures), changed_file)
 
 
 def write_manifest(run: Run) -> None:
     """Write one row for every planned episode, the statistics for OpenVLA-OFT, and the counts."""
     config, outcome = run.config, run.outcome
-    table = manifest.build(outcome, registry.places(run.formats), registry.columns(), config.export.where)
+    table = manifest.build(
+        outcome,
+        registry.places(run.formats),
+        registry.columns(),
+        config.export.where,
+        lambda row: export.wordings(config.plan.axes.language, row.suite, row.task, row.axis),
+    )
     manifest.write(table, run.manifest_file, manifest.Settings.of(config))
 
     row_of = outcome.row_of
@@ -267,7 +272,7 @@ def write_recipe(run: Run) -> None:
     from pipeline.clients import recipe
 
     export = run.config.export
-    built = recipe.build(run.manifest_file, run.manifest, export)
+    built = recipe.build(run.manifest_file, run.manifest, export, run.config.finetune.rewrite_probability)
     recipe.write(built, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
     file = run.path(FINETUNE) / RECIPE
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
@@ -281,6 +286,7 @@ def summarize(run: Run) -> None:
         _render_sheets(run)
         memory.keep()
     Console().print(counts.shown(rows, episodes))
+    print(counts.Diversity.of(rows))
     for sentence in (*counts.shortfalls(counts.targets(rows, episodes)), *counts.beyond_step_limit(rows)):
         print(sentence)
 
@@ -327,7 +333,8 @@ def _changed_frames(run: Run) -> Path | None:
 _OUTCOME = (PLAN, TRAJECTORIES_TABLE, FRAMES_TABLE)
 _RECORDS = tuple(f"{kind.name}.json" for kind in registry.FORMATS)
 _REPORTS = (LEAKAGE, VALIDATION, STATISTICS)
-_EXPORT = ("filter", "export")
+_LABELLED = ("filter", "export", "plan")
+"""Settings of stages that list rewrites: they depend on the plan's language axis and, by ``INPUTS``, on the bank."""
 
 STAGES = {
     "inputs": Stage(write_inputs),
@@ -349,9 +356,9 @@ STAGES = {
         _changed_frames,
     ),
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
-    "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
+    "manifest": Stage(write_manifest, _LABELLED, (INPUTS, *_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
     "validate": Stage(validate),
-    "recipe": Stage(write_recipe, ("export",), (MANIFEST, *_RECORDS), (FINETUNE,)),
+    "recipe": Stage(write_recipe, ("export", "finetune"), (MANIFEST, *_RECORDS), (FINETUNE,)),
     "summary": Stage(summarize),
     "card": Stage(write_card, ("export", "publish"), (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
     "report": Stage(write_report),

@@ -9,7 +9,8 @@ from collections.abc import Collection
 from dataclasses import fields
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -30,15 +31,22 @@ def column(name: str, values: pa.DataType, meaning: str) -> pa.Field:
 
 
 def columns_of(record: type[Any]) -> list[pa.Field]:
-    """Return a column for each field of a dataclass of ``Annotated[type, meaning]``; the type may be optional."""
+    """Return a column for each field of a dataclass of ``Annotated[type, meaning]``; it may be optional or a list."""
     hints = get_type_hints(record, include_extras=True)
     columns = []
     for each in fields(record):
         declared, meaning = get_args(hints[each.name])
-        alternatives = get_args(declared) or (declared,)
-        kind = next(alternative for alternative in alternatives if alternative is not type(None))
-        columns.append(column(each.name, _TYPES[kind], meaning))
+        columns.append(column(each.name, _arrow_type(declared), meaning))
     return columns
+
+
+def _arrow_type(declared: Any) -> pa.DataType:
+    """Return the type of a column's values, given the type ``X``, ``list[X]``, or one of these ``| None``."""
+    alternatives = get_args(declared) if isinstance(declared, UnionType) else (declared,)
+    kind = next(alternative for alternative in alternatives if alternative is not NoneType)
+    if get_origin(kind) is list:
+        return pa.list_(_TYPES[get_args(kind)[0]])
+    return _TYPES[kind]
 
 
 def write_table(table: pa.Table, path: Path) -> None:

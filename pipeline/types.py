@@ -24,7 +24,7 @@ Frame = NDArray[np.uint8]
 """(H, W, 3) RGB."""
 Jpeg = NewType("Jpeg", bytes)
 """Content of a JPEG file: an encoded frame, as every dataset carries it."""
-RenderedExtra = Literal["depth", "segmentation", "object_poses"]
+RenderedExtra = Literal["depth", "segmentation", "object_poses", "boxes"]
 """Optional output of the render stage in addition to frames."""
 Extra = Literal[RenderedExtra, "outcome"]
 """Optional content of a dataset in addition to frames; ``outcome`` states why each episode of a failures set failed."""
@@ -263,11 +263,20 @@ class Geometry:
         intrinsics: (3, 3) float32, camera to pixels of the stored frame.
         extrinsics: (4, 4) float32, camera to the reference frame of the view: the world, or the end effector.
         maps: ``depth`` and ``segmentation``, where requested, to T PNG files, rotated like the frames.
+        boxes: (T, 24, 4) float32, ``None`` if not requested.
     """
 
     intrinsics: NDArray[np.float32]
     extrinsics: NDArray[np.float32]
     maps: Mapping[Extra, Sequence[bytes]] = field(default_factory=dict)
+    boxes: NDArray[np.float32] | None = None
+
+
+class Subtask(NamedTuple):
+    """Description of the current subtask in plain words, valid from the moment before the action ``step``."""
+
+    step: int
+    text: str
 
 
 @dataclass(frozen=True)
@@ -281,8 +290,9 @@ class Rendered:
         rejected: stream id to the reason why it was not rendered.
         geometry: id of a stream's geometry to the geometry.
         object_poses: (K, 24, 7) float32, ``None`` if not requested.
-        instances: names of the objects that segmentation and poses number; empty without these extras.
+        instances: names of the objects that segmentation, poses and boxes number; empty without these extras.
         quality: quality measures of the trajectory.
+        subtasks: subtasks of the trajectory in their order.
     """
 
     replay_mode: str
@@ -296,13 +306,7 @@ class Rendered:
     object_poses: NDArray[np.float32] | None = None
     instances: Sequence[str] = ()
     quality: Quality | None = None
-
-
-class Subtask(NamedTuple):
-    """Description of the current subtask in plain words, valid from the moment before the action ``step``."""
-
-    step: int
-    text: str
+    subtasks: Sequence[Subtask] = ()
 
 
 @dataclass(frozen=True)
@@ -317,8 +321,8 @@ class Episode:
         provenance: the columns named in ``schemas/episode.json``.
         geometry: view name to its camera matrices and maps.
         object_poses, instances: as in ``Rendered``.
-        rewrites: other wordings of its task, for training; empty if not requested.
-        subtasks: its subtasks in their order; empty if not requested.
+        rewrites: other wordings of its task, for training.
+        subtasks: its subtasks in their order; empty if the trajectory manipulates nothing that the goal names.
     """
 
     episode_id: str

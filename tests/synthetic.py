@@ -24,15 +24,20 @@ from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export
-from pipeline.types import Episode, Extra, Geometry, Jpeg
+from pipeline.types import Episode, Extra, Geometry, Jpeg, Subtask
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
 SET = f"{NAME}_spatial"
 REPO = NAME
 
+REWRITES = ("kindly put the bowl on the plate", "the plate is where the bowl goes")
+SUBTASKS = (Subtask(0, "approach the bowl"), Subtask(5, "grasp the bowl"), Subtask(10, "move the bowl to the plate"))
+WITHOUT_LABELS = IDS[0]
+"""Episode without subtasks and rewrites, the first of its files."""
+
 MATRICES = {"intrinsics": (3, 3), "extrinsics": (4, 4)}
-EXTRAS: tuple[Extra, ...] = ("depth", "segmentation", "object_poses")
+EXTRAS: tuple[Extra, ...] = ("depth", "segmentation", "object_poses", "boxes")
 
 Tree = dict[str, bytes]
 
@@ -72,6 +77,8 @@ def episode(episode_id: str) -> Episode:
         instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
         provenance=provenance | {"episode_id": episode_id},
         geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
+        rewrites=() if episode_id == WITHOUT_LABELS else REWRITES,
+        subtasks=() if episode_id == WITHOUT_LABELS else SUBTASKS,
     )
 
 
@@ -84,7 +91,7 @@ def goals(state: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np
 
 @cache
 def with_extras(episode_id: str) -> Episode:
-    """Generate the episode of ``episode`` with depth, segmentation and poses."""
+    """Generate the episode of ``episode`` with depth, segmentation, poses and boxes."""
     source, rng = episode(episode_id), seeding.rng("test_writers", "extras", episode_id)
     steps = len(source)
 
@@ -96,9 +103,12 @@ def with_extras(episode_id: str) -> Episode:
             "segmentation": [cv2.imencode(".png", each)[1].tobytes() for each in small],
         }
 
+    def boxes() -> NDArray[np.float32]:
+        return rng.integers(0, 128, size=(steps, 24, 4)).astype(np.float32)
+
     return replace(
         source,
-        geometry={view: replace(seen, maps=maps()) for view, seen in source.geometry.items()},
+        geometry={view: replace(seen, maps=maps(), boxes=boxes()) for view, seen in source.geometry.items()},
         object_poses=rng.normal(size=(steps, 24, 7)).astype(np.float32),
         instances=("nothing", "robot", episode_id),
     )

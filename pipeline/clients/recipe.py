@@ -47,13 +47,16 @@ def sourced(value: Any, source: str) -> dict[str, Any]:
     return {"value": value, "source": source}
 
 
-def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: ExportConfig) -> dict[str, Any]:
+def build(
+    manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: ExportConfig, rewrite_probability: float = 0.0
+) -> dict[str, Any]:
     """Return the fine-tuning recipe of a run.
 
     Args:
         manifest_file: the run's manifest, whose hash identifies the datasets. The manifest stores the content hash of
             every episode, its place in each format, and the versions and the device that generated it.
         export: the datasets that the run exports; its RLDS name is OpenVLA-OFT's name for all RLDS datasets.
+        rewrite_probability: ``finetune.rewrite_probability``.
     """
     rlds, lerobot = export.options_for(Rlds), export.options_for(LeRobot)
     kept = [row for row in rows if row["kept"]]
@@ -80,10 +83,11 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
         oft_validates = bool(validating) and validating == {*suites.values()}
     if lerobot is not None:
         dataset["lerobot"] = sourced(lerobot.name, "the run's configuration, export.lerobot.name")
-    return {"name": (rlds or export).name, "dataset": dataset, **_training_and_clients(export, oft_validates)}
+    sections = _training_and_clients(export, oft_validates, rewrite_probability)
+    return {"name": (rlds or export).name, "dataset": dataset, **sections}
 
 
-def _training_and_clients(export: ExportConfig, oft_validates: bool) -> dict[str, Any]:
+def _training_and_clients(export: ExportConfig, oft_validates: bool, rewrite_probability: float) -> dict[str, Any]:
     """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``.
 
     Clients whose format is not exported are listed with the setting that exports it.
@@ -92,6 +96,7 @@ def _training_and_clients(export: ExportConfig, oft_validates: bool) -> dict[str
     values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
+    values |= {"rewrite_probability": rewrite_probability}
     values |= {"ipec_set": _v21_of(export, "ipec"), "openpi_set": _v21_of(export, "openpi")}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
     missing = {client: setting for client, setting in EXPORTS.items() if client not in sections["clients"]}

@@ -103,7 +103,7 @@ class StepSizes(NamedTuple):
     Attributes:
         frame_kb: one frame of one view.
         maps_kb: depth and segmentation of one view, as far as they are stored.
-        poses_kb: object poses, as far as they are stored.
+        poses_kb: object poses and boxes, as far as they are stored.
         motion_kb: state, action and all other columns except the frames.
     """
 
@@ -135,8 +135,6 @@ class Format(ABC, Generic[Options]):
     """Packages that compute the bytes of the files."""
     group: ClassVar[str]
     """Name of the format that is written by the same stage, ``export_<group>``; most often the format's own name."""
-    rewrites_instructions: ClassVar[bool] = False
-    """True if the format can store rewrites of instructions, which depend on the plan's language axis."""
     splits_each_suite: ClassVar[bool] = False
     """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
     step_s: ClassVar[float]
@@ -145,7 +143,8 @@ class Format(ABC, Generic[Options]):
     """Columns of the manifest with the place of an episode; null when it was dropped."""
     keys: Mapping[str, str]
     """Names in this format of each view, of ``state``, ``joint_state`` and ``action``, and of each view's matrices and
-    maps, such as ``image_depth``. ``provenance`` is the place of an episode's provenance, matrices and instances."""
+    maps, such as ``image_depth``. ``provenance`` is the place of an episode's provenance, matrices and instances;
+    ``labels`` is the place of its subtasks and rewrites."""
     clients: tuple[str, ...]
     """The clients of ``finetune.yaml`` that train on this format."""
     gripper: GripperSpec = SCHEMA.action.gripper
@@ -173,7 +172,7 @@ class Format(ABC, Generic[Options]):
 
     @property
     def language(self) -> bool:
-        """Return whether the format stores an episode's rewrites and subtasks."""
+        """Return whether every frame has lerobot's language column."""
         return False
 
     @property

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.errors import MAKE_AGAIN
 from pipeline.files import checksum
 from pipeline.images.jpeg import decode
-from pipeline.types import Episode, Frame
+from pipeline.types import Episode, Frame, Subtask
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,15 @@ class Written:
         except OSError as error:
             return [Fault(self.dataset, None, f"{self.file}: cannot be read ({error})", expected)]
         return [] if same else [Fault(self.dataset, None, f"{self.file}: has changed since it was written", expected)]
+
+
+def subtasks_of(starts: Sequence[int], texts: Sequence[str]) -> tuple[Subtask, ...]:
+    """Join the two lists of an episode's subtasks.
+
+    Raises:
+        ValueError: when they differ in length.
+    """
+    return tuple(Subtask(start, text) for start, text in zip(starts, texts, strict=True))
 
 
 def in_both_splits(

@@ -50,7 +50,7 @@ class Rlds(Format[RldsConfig]):
     title: ClassVar = "RLDS"
     options_type: ClassVar = RldsConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 7
+    recipe: ClassVar = 8
     packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
     splits_each_suite: ClassVar = True  # OpenVLA-OFT, when it validates, reads the split val of each set.
     group: ClassVar = "rlds"
@@ -63,8 +63,9 @@ class Rlds(Format[RldsConfig]):
 
     def __init__(self, data: Path, options: RldsConfig, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
-        of_cameras = [f"{view}_{name}" for view in content.views for name in (*MATRICES, *MAPS)]
-        self.keys = {name: name for name in (*content.views, *MOTION, *of_cameras)} | {"provenance": "episode_metadata"}
+        of_cameras = [f"{view}_{name}" for view in content.views for name in (*MATRICES, *MAPS, "boxes")]
+        self.keys = {name: name for name in (*content.views, *MOTION, *of_cameras)}
+        self.keys |= dict.fromkeys(("provenance", "labels"), "episode_metadata")
 
     def step_kb(self, sizes: StepSizes) -> float:
         return len(self.content.views) * (sizes.frame_kb + sizes.maps_kb) + sizes.poses_kb + sizes.motion_kb

@@ -9,11 +9,11 @@ from typing import Any
 import tensorflow_datasets as tfds
 from google.protobuf import json_format
 
-from pipeline.episode_schema import MATRICES, Content
+from pipeline.episode_schema import MATRICES, SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
-from pipeline.formats.read_back import Copy, Fault, in_both_splits, unlike
+from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of, unlike
 from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.rlds_write import texts as rlds_texts
@@ -199,11 +199,17 @@ def _opened(info_file: Edition) -> Any:
 def _geometry(steps: Mapping[str, Any], view: str, content: Content) -> Geometry:
     matrices = {name: steps[f"{METADATA}{view}_{name}"] for name in MATRICES}
     maps = {name: steps[f"observation/{view}_{name}"].tolist() for name in content.maps}
-    return Geometry(**matrices, maps=maps)
+    boxes = steps[f"observation/{view}_boxes"] if "boxes" in content.extras else None
+    return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
 def _said(value: Any) -> str | int | float:
     return value.decode() if isinstance(value, bytes) else value.item()
+
+
+def _labels(steps: Mapping[str, Any], name: str) -> list[Any]:
+    values = steps[METADATA + name].tolist()
+    return [text.decode() for text in values] if SCHEMA.labels[name] == "string" else values
 
 
 def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
@@ -222,6 +228,8 @@ def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
         geometry={view: _geometry(steps, view, content) for view in content.views},
         object_poses=steps["observation/object_poses"] if "object_poses" in content.extras else None,
         instances=json.loads(steps[f"{METADATA}instances"][0]) if content.has_names else (),
+        rewrites=_labels(steps, "rewrites"),
+        subtasks=subtasks_of(_labels(steps, "subtask_starts"), _labels(steps, "subtask_texts")),
     )
     return Copy(
         dataset="rlds",

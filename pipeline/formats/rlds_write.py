@@ -1,8 +1,8 @@
 """Writer of shards and metadata of RLDS sets, without TensorFlow.
 
 Feature names, shapes and dtypes are those of OpenVLA's ``libero_*_no_noops`` sets (hub:
-``openvla/modified_libero_rlds``). Provenance and the cameras' matrices are added to ``episode_metadata``, extras to
-``observation``; the loaders ignore these additions.
+``openvla/modified_libero_rlds``). Provenance, labels and the cameras' matrices are added to ``episode_metadata``,
+extras to ``observation``; the loaders ignore these additions.
 """
 
 import json
@@ -15,7 +15,17 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MATRICES, SCHEMA, STANDARD, Content, MapSpec, MatrixSpec, VectorSpec, check
+from pipeline.episode_schema import (
+    MATRICES,
+    SCHEMA,
+    STANDARD,
+    Content,
+    MapSpec,
+    MatrixSpec,
+    VectorSpec,
+    check,
+    labels_of,
+)
 from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
@@ -97,6 +107,8 @@ def features(content: Content = STANDARD) -> Any:
     observation |= {"state": _tensor(SCHEMA.state), "joint_state": _tensor(SCHEMA.joint_state)}
     for name in content.maps:
         observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name), content) for view in content.views}
+    if "boxes" in content.extras:
+        observation |= {f"{view}_boxes": _tensor(SCHEMA.boxes) for view in content.views}
     if "object_poses" in content.extras:
         observation["object_poses"] = _tensor(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
@@ -123,7 +135,10 @@ def features(content: Content = STANDARD) -> Any:
         metadata[key] = tfds.features.Text(doc=doc) if dtype == "string" else scalar(np.dtype(dtype), doc=doc)
     metadata |= {f"{view}_{name}": _tensor(getattr(SCHEMA, name)) for view in content.views for name in MATRICES}
     if content.has_names:
-        metadata["instances"] = tfds.features.Text(doc="JSON list of names; segmentation and poses have places in it")
+        metadata["instances"] = tfds.features.Text(doc="JSON list of names, whose places the extras use")
+    for key, dtype in SCHEMA.labels.items():
+        value = tfds.features.Text() if dtype == "string" else scalar(np.dtype(dtype))
+        metadata[key] = tfds.features.Sequence(value, doc=meanings[key])
     return tfds.features.FeaturesDict({"steps": tfds.features.Dataset(step), "episode_metadata": metadata})
 
 
@@ -156,6 +171,8 @@ def _nested_example(episode: Episode) -> dict[str, Any]:
         columns["object_poses"] = episode.object_poses
     for view, geometry in episode.geometry.items():
         columns |= {f"{view}_{name}": files for name, files in geometry.maps.items()}
+        if geometry.boxes is not None:
+            columns[f"{view}_boxes"] = geometry.boxes
     steps = []
     for t in range(len(episode)):
         step = {
@@ -175,4 +192,5 @@ def _nested_example(episode: Episode) -> dict[str, Any]:
         metadata |= {f"{view}_{name}": getattr(geometry, name) for name in MATRICES}
     if episode.instances:
         metadata["instances"] = json.dumps(list(episode.instances))
+    metadata |= labels_of(episode)
     return {"steps": steps, "episode_metadata": metadata}

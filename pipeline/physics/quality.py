@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
-from pipeline.scenes.compiled import ARM, FINGERS, CompiledScene, grip_pose
+from pipeline.scenes.compiled import ARM, FINGERS, CompiledScene, contacts, grip_pose
 from pipeline.types import Floats, Quality, State, Task, Trajectory
 
 MOVED_M = 0.001
@@ -36,7 +36,7 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
         grip = grip_pose(scene.data)
         positions.append(grip.position_m)
         rotations.append(grip.rotation)
-        root_pairs = model.body_rootid[scene.contacts].tolist()
+        root_pairs = model.body_rootid[contacts(scene.data)].tolist()
         touched_roots: set[int] = set()
         for pair in root_pairs:
             if robot in pair:

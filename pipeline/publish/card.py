@@ -24,7 +24,7 @@ from pipeline.generated import generated
 from pipeline.libero.tasks import SUITES
 from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
-from pipeline.run.counts import Counts, named, origins, tally, targets, tried
+from pipeline.run.counts import Counts, Diversity, diversity, named, origins, tally, targets, tried
 from pipeline.run.layout import CARD, FINETUNE, MANIFEST, SHEETS
 from pipeline.run.run import Run
 
@@ -153,6 +153,8 @@ def render(
         counts=Counts.of,
         targets=targets(rows, episodes),
         levels=LEVELS,
+        diversity=diversity(kept),
+        total=Diversity.of(kept),
         axes=axes,
         sheets=sheets,
         yields=_yields(rows),

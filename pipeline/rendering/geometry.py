@@ -1,4 +1,4 @@
-"""Camera matrices, depth and segmentation of a view, and the table of instance ids.
+"""Camera matrices, depth, segmentation and boxes of a view, and the table of instance ids.
 
 All conventions follow ``schemas/episode.json``.
 """
@@ -34,17 +34,23 @@ class Instances:
 
     Attributes:
         names: the name of each id.
+        boxed: ids of the things with boxes: the gripper, and the things that the task's goal names.
 
     Raises:
-        PipelineError: if the scene has more things than ``object_poses`` has rows.
+        PipelineError: if the scene has more things than ``object_poses`` and ``boxes`` have rows.
     """
 
     def __init__(self, model: mujoco.MjModel, trajectory: Trajectory, task: Task):
-        things = bddl.read(task.bddl_file).things
+        problem = bddl.read(task.bddl_file)
+        things = problem.things
         self.names: tuple[str, ...] = (*COMMON, *things, *added_names(trajectory.scene.resolved))
         rows = SCHEMA.object_poses.shape[0]
         if len(self.names) > rows:
             raise PipelineError(f"a scene of {task.name} has {len(self.names)} things", expected=f"{rows} or fewer")
+        goal_names: set[str] = set()
+        for fact in problem.goal:
+            goal_names.update(problem.things_named(fact[1:]))
+        self.boxed = (GRIPPER, *(self.names.index(name) for name in things if name in goal_names))
         bodies = [model.body(number).name for number in range(model.nbody)]
         self._bodies = {ROBOT: model.body("robot0_base").id, GRIPPER: model.body("gripper0_right_gripper").id}
         for body, name in enumerate(bodies):
@@ -73,6 +79,20 @@ class Instances:
             ids[pixels] = of_number[surfaces.number[pixels]]
         return ids
 
+    def boxes(self, ids: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return the box of each thing of ``boxed``, by the ids (H, W) of a frame as it is stored.
+
+        The rows of other things, and of things without pixels, are zero.
+        """
+        boxes: NDArray[Any] = np.zeros(SCHEMA.boxes.shape, SCHEMA.boxes.dtype)
+        for instance in self.boxed:
+            shown = ids == instance
+            columns, rows = np.flatnonzero(shown.any(axis=0)), np.flatnonzero(shown.any(axis=1))
+            if len(rows):
+                x, y = columns[0], rows[0]
+                boxes[instance] = x, y, columns[-1] - x + 1, rows[-1] - y + 1
+        return boxes
+
     def poses(self, data: mujoco.MjData) -> NDArray[np.float32]:
         """Return position (m) and quaternion (w, x, y, z) of each name's body in the world.
 
@@ -89,22 +109,29 @@ def see(
 ) -> Geometry:
     """Render the geometry of a stream's view of a trajectory.
 
-    The geometry has the camera matrices. With extras, it also has depth, and segmentation by the ids of ``instances``,
-    before each executed action.
+    The geometry has the camera matrices. With extras, it also has depth, and segmentation and boxes by the ids of
+    ``instances``, before each executed action.
     """
     view = ALL_VIEWS[stream.view]
     maps: dict[Extra, list[bytes]] = {name: [] for name in MAPS if name in extras}
+    boxes: list[NDArray[np.float32]] = []
+    drawn = {*MAPS, "boxes"} & set(extras)
     with renderer.perturbed(stream.changes):
         renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
         intrinsics, extrinsics = matrices(renderer, stream.view)
-        for step in range(len(trajectory.actions) if maps else 0):
+        for step in range(len(trajectory.actions) if drawn else 0):
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             surfaces = renderer.surfaces(view.camera)
             if "depth" in maps:
                 maps["depth"].append(encode_exactly(to_policy(_in_units(surfaces.depth_m))))
-            if "segmentation" in maps and instances:
-                maps["segmentation"].append(encode_exactly(to_policy(instances.ids(surfaces))))
-    return Geometry(intrinsics, extrinsics, maps)
+            if instances is None:
+                continue
+            ids = to_policy(instances.ids(surfaces))
+            if "segmentation" in maps:
+                maps["segmentation"].append(encode_exactly(ids))
+            if "boxes" in extras:
+                boxes.append(instances.boxes(ids))
+    return Geometry(intrinsics, extrinsics, maps, np.stack(boxes) if boxes else None)
 
 
 def matrices(renderer: Renderer, view: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

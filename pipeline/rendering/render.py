@@ -16,11 +16,12 @@ from pipeline.episode_schema import ALL_VIEWS
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.physics.controller_goals import absolute_actions, first_posture
+from pipeline.physics.subtasks import subtasks_by_contacts
 from pipeline.planning.streams import Stream
 from pipeline.rendering.geometry import Instances, see
 from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import FirstFrame
-from pipeline.scenes.compiled import grip_pose, proprioception
+from pipeline.scenes.compiled import contacts, grip_pose, proprioception
 from pipeline.types import Floats, Frame, Jpeg, Rendered, Task, Trajectory
 
 Started = Mapping[str, Callable[[], Frame]]
@@ -41,13 +42,16 @@ def render(
     steps = range(len(trajectory.actions))
     renderer.restore(first_posture(trajectory.scene, renderer.model), trajectory.site_alpha[0])
     first_grip = grip_pose(renderer.data)
-    proprioceptions, grips, poses = [], [], []
+    proprioceptions, grips, poses, pairs = [], [], [], []
     for step in steps:
         renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
         proprioceptions.append(proprioception(renderer.data))
         grips.append(grip_pose(renderer.data))
         if instances:
             poses.append(instances.poses(renderer.data))
+        pairs.append(contacts(renderer.data))
+    renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
+    pairs.append(contacts(renderer.data))
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
     goals = absolute_actions(trajectory.actions, first_grip, grips)
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
@@ -79,6 +83,7 @@ def render(
         object_poses=np.stack(poses) if "object_poses" in render_config.extras else None,
         instances=instances.names if instances else (),
         quality=trajectory.quality,
+        subtasks=subtasks_by_contacts(trajectory, task, renderer.model, pairs),
     )
 
 

@@ -27,7 +27,7 @@ from pipeline.report.pages import Clip
 from pipeline.report.sheets import describe_all, name_episode
 from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
-from pipeline.run.counts import Counts, Rows, by_axis
+from pipeline.run.counts import Counts, Diversity, Rows, by_axis
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.layout import LEAKAGE, PREVIEWS, SHEETS
 from pipeline.run.run import Run
@@ -75,6 +75,7 @@ def page(run: Run, test: TestSet) -> str:
         origins=counts.origins(kept, config.demos.source),
         headline=_headline(tried, kept),
         yields=[yields.wanted_and_kept(counts.targets(rows, config.plan.episodes)), *yields.tables(tried)],
+        diversity=yields.by_task(kept),
         shortfalls=[
             *counts.shortfalls(counts.targets(rows, config.plan.episodes)),
             *counts.beyond_step_limit(rows),
@@ -104,6 +105,7 @@ def _headline(tried: Rows, kept: Rows) -> dict[str, str]:
     headline = {
         **asdict(Counts.of(tried)),
         "kept clean twins": sum(row["role"] == "twin" for row in kept),
+        "action sequences": Diversity.of(kept).sequences,
         "tasks": len({(row["suite"], row["task"]) for row in kept}),
         "steps": steps,
         f"minutes at {SCHEMA.fps_hz} Hz": round(steps / SCHEMA.fps_hz / 60),

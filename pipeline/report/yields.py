@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS
-from pipeline.run.counts import Counts, Rows, Target, named, tally
+from pipeline.run.counts import Counts, Diversity, Rows, Target, diversity, named, tally
 
 
 class Cell(NamedTuple):
@@ -36,6 +36,17 @@ def tables(tried: Rows) -> list[Table]:
         _by_axis("Dropped episodes, by reason", [row for row in tried if not row["kept"]], "reason"),
         _by_axis("Kept episodes, by replay mode", [row for row in tried if row["kept"]], "replay_mode"),
     ]
+
+
+def by_task(kept: Rows) -> Table:
+    """Tabulate the kept episodes and their action sequences by task, with totals."""
+    body: list[tuple[Cell, ...]] = []
+    for task, figures in {**diversity(kept), "all": Diversity.of(kept)}.items():
+        share = figures.sequences / figures.episodes
+        numbers = (Cell(f"{figures.episodes:,}"), Cell(f"{figures.sequences:,}", share), Cell(f"{figures.original:,}"))
+        body.append((Cell(task), *numbers))
+    head = ("task", "episodes", "distinct sequences", "as recorded")
+    return Table("Action sequences of kept episodes, by task", head, body)
 
 
 def wanted_and_kept(targets: Mapping[str, Target]) -> Table:

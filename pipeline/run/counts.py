@@ -64,6 +64,40 @@ class Target:
     kept: int
 
 
+@dataclass(frozen=True)
+class Diversity:
+    """Numbers of kept episodes and of their action sequences.
+
+    Attributes:
+        sequences: number of distinct sequences; two differ if the stored actions of any step differ.
+        original: number of episodes that repeat the recorded actions of their demonstration exactly, without no-ops.
+    """
+
+    episodes: int
+    sequences: int
+    original: int
+
+    @classmethod
+    def of(cls, rows: Rows) -> Diversity:
+        kept = [row for row in rows if row["kept"]]
+        sequences = {row["actions_sha256"] for row in kept}
+        # An open-loop replay sends the recorded actions, and is kept only if it executed all of them.
+        original = sum(row["replay_mode"] == "open_loop" for row in kept)
+        return cls(len(kept), len(sequences), original)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.episodes:,} kept episodes have {self.sequences:,} distinct action sequences; {self.original:,} "
+            "repeat the actions of their demonstration exactly"
+        )
+
+
+def diversity(rows: Rows) -> dict[str, Diversity]:
+    """Map each task with kept episodes, ``<suite>/<task>``, to the numbers of its action sequences."""
+    by_task = grouped((f"{row['suite']}/{row['task']}", row) for row in rows if row["kept"])
+    return {task: Diversity.of(rows_of_task) for task, rows_of_task in sorted(by_task.items())}
+
+
 def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
     """Map each axis or combination to its target, ``clean`` first.
 

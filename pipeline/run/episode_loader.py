@@ -1,7 +1,7 @@
 """Loader that joins the plan and the rendered streams to an ``Episode``, which a writer puts into a dataset."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -9,13 +9,12 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import Content
 from pipeline.files import Edition, edition
 from pipeline.identity import versions
-from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Episode, Subtask
+from pipeline.types import Episode
 
 
 @dataclass(frozen=True)
@@ -24,13 +23,13 @@ class EpisodeLoader:
 
     Attributes:
         failures: True for failures, which have further columns.
-        rewrites: episode id to other wordings of its task. Episodes get rewrites and subtasks only if it is set.
+        rewrites: episode id to other wordings of its task; without them, the episode has none.
     """
 
     data: Path
     render_config: RenderConfig
     failures: bool = False
-    rewrites: Mapping[str, Sequence[str]] | None = None
+    rewrites: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @cached_property
     def content(self) -> Content:
@@ -54,7 +53,7 @@ class EpisodeLoader:
         if self.failures:
             verdict = TrajectoryStore(self.data / TRAJECTORIES).load(row.trajectory_id).verdict
             values |= {"success": verdict.kept, "reason": verdict.reason}
-        episode = Episode(
+        return Episode(
             episode_id=episode_id,
             frames={view: rendered.streams[stream.stream_id] for view, stream in streams.items()},
             state=rendered.state,
@@ -66,21 +65,11 @@ class EpisodeLoader:
             geometry={view: rendered.geometry[name] for view, name in geometry.items()},
             object_poses=rendered.object_poses,
             instances=rendered.instances,
+            rewrites=self.rewrites.get(episode_id, ()),
+            subtasks=rendered.subtasks,
         )
-        if self.rewrites is None:
-            return episode
-        subtasks = _subtasks(self.data / TRAJECTORIES, row.trajectory_id, row.suite, row.task)
-        return replace(episode, rewrites=self.rewrites[episode_id], subtasks=subtasks)
 
 
 @lru_cache(maxsize=1)
 def _rows_by_id(plan_file: Edition) -> dict[str, plan.Row]:
     return {row.episode_id: row for row in plan.read(plan_file.path)}
-
-
-@lru_cache(maxsize=10_000)
-def _subtasks(trajectories: Path, trajectory_id: str, suite: str, task: str) -> tuple[Subtask, ...]:
-    """Return the subtasks of a trajectory; cached, because episodes share trajectories and are loaded in any order."""
-    from pipeline.physics.subtasks import subtasks  # Only episodes with subtasks need the simulator.
-
-    return subtasks(TrajectoryStore(trajectories).load(trajectory_id), find_task(suite, task))

@@ -122,18 +122,17 @@ def _files(folder: Path) -> list[Path]:
 def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     """Return the episodes of a dataset in the order they are written: the kept episodes of a run, or its failures.
 
-    If the format takes ``language``, the episodes have subtasks and rewrites: all rewrites that the run's language axis
-    may sample for the episode. Without this axis, its default ranges decide.
+    Each episode has all rewrites that the run's language axis may sample for it. Without this axis, its default ranges
+    decide.
     """
     failures = "outcome" in target.content.extras
-    rewrites: dict[str, tuple[str, ...]] | None = {} if target.language else None
+    rewrites: dict[str, tuple[str, ...]] = {}
     outcome, language = run.outcome, run.config.plan.axes.language
     episodes: dict[str, Known] = {}
     for episode_id in shuffled(outcome.missed) if failures else outcome.kept:
         row, content = outcome.row_of[episode_id], outcome.content(episode_id)
-        if rewrites is not None:
-            rewrites[episode_id] = wordings(language, row.suite, row.task, row.axis)
-            content = digest(content, rewrites[episode_id])[:16]
+        rewrites[episode_id] = wordings(language, row.suite, row.task, row.axis)
+        content = digest(content, rewrites[episode_id])[:16]
         steps = outcome.trajectories[row.trajectory_id]["steps"]
         episodes[episode_id] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
     return Episodes(episodes, run.episodes(failures=failures, rewrites=rewrites))

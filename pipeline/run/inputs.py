@@ -22,7 +22,7 @@ HASHED_BYTES = 16_000_000
 """Largest size of a file that is listed by its content; larger files are listed by size and time of change."""
 
 
-SECTIONS = ("demos", "plan", "replay", "filter", "render", "export", "compute", "publish")
+SECTIONS = ("demos", "plan", "replay", "filter", "render", "export", "finetune", "compute", "publish")
 """Sections of a configuration, in the order of ``settings.json``."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -61,6 +61,21 @@ class Result:
         float | None, "path_m divided by path_m of the clean twin; null if one of them did not reach the goal"
     ]
     gl_device: Annotated[str | None, "OpenGL name of the device that rendered the frames; null when not rendered"]
+    actions_sha256: Annotated[
+        str | None,
+        "SHA-256 of the stored actions (float32, rows of 7); equal for equal sequences; null when not rendered",
+    ]
+    subtask_starts: Annotated[
+        list[int] | None,
+        "first step of each subtask, in order; a subtask lasts until the next begins; empty if the robot manipulates "
+        "nothing that the goal names; null when not rendered",
+    ]
+    subtask_texts: Annotated[list[str] | None, "each subtask in words; null when not rendered"]
+    rewrites: Annotated[
+        list[str] | None,
+        "other wordings of the task that training may use in place of the instruction: all that the run's language "
+        "axis may sample for the episode; null when not rendered",
+    ]
 
 
 class Settings(Frozen):
@@ -87,7 +102,11 @@ class Settings(Frozen):
 
 
 def build(
-    run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequence[pa.Field], where: Where | None
+    run: Outcome,
+    places: Mapping[str, Mapping[str, Any]],
+    columns: Sequence[pa.Field],
+    where: Where | None,
+    rewrites: Callable[[plan.Row], Sequence[str]],
 ) -> pa.Table:
     """Join the plan with the results of its episodes.
 
@@ -96,6 +115,7 @@ def build(
         places: id of every kept episode to its place in the datasets.
         columns: columns of ``places``.
         where: ``export.where``.
+        rewrites: function that returns the rewrites of an episode.
     """
     version_of_column = {version_column(name): version for name, version in versions().items()}
     table = []
@@ -103,6 +123,7 @@ def build(
         verdict = run.verdicts[row.episode_id]
         # The trajectory of a reserve that was not needed may be stored for another episode.
         replayed = run.trajectories.get(row.trajectory_id, {}) if verdict.reason != NOT_NEEDED else {}
+        frames = run.frames[row.trajectory_id] if replayed and rendered(row, run.frames) else None
         result = Result(
             kept=verdict.kept,
             reason=verdict.reason,
@@ -112,7 +133,11 @@ def build(
             exceeds_step_limit=exceeds_step_limit(row.suite, replayed["steps"]) if replayed else None,
             resolved=replayed.get("resolved"),
             path_ratio=_ratio(replayed, run.trajectories.get(run.row_of[row.twin_id].trajectory_id, {})),
-            gl_device=run.frames[row.trajectory_id].device if replayed and rendered(row, run.frames) else None,
+            gl_device=frames.device if frames else None,
+            actions_sha256=frames.actions_sha256 if frames else None,
+            subtask_starts=[subtask.step for subtask in frames.subtasks] if frames else None,
+            subtask_texts=[subtask.text for subtask in frames.subtasks] if frames else None,
+            rewrites=list(rewrites(row)) if frames else None,
         )
         quality = {each.name: replayed.get(each.name) for each in fields(Quality)}
         place = places.get(row.episode_id, {})

@@ -125,7 +125,7 @@ class Run:
 
     def episodes(self, *, failures: bool = False, rewrites: Mapping[str, Sequence[str]] | None = None) -> EpisodeLoader:
         """Return the loader of rendered episodes; for ``failures`` and ``rewrites`` see ``EpisodeLoader``."""
-        return EpisodeLoader(self.folder, self.config.render, failures, rewrites)
+        return EpisodeLoader(self.folder, self.config.render, failures, rewrites or {})
 
     def workers(self, *, renders: bool = False) -> AbstractContextManager[Workers]:
         """Start the workers of the section ``compute``, which stop when the context ends."""

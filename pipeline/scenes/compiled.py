@@ -80,12 +80,6 @@ class CompiledScene:
         first = int(self.model.joint(f"{name}_joint0").qposadr[0])
         return State.of(state, self.model.nq).qpos[first : first + 7]
 
-    @property
-    def contacts(self) -> NDArray[np.intp]:
-        """Pairs (C, 2) of bodies in contact."""
-        contact = self.data.contact
-        return np.asarray(self.model.geom_bodyid[contact.geom[contact.dist <= 0]], np.intp)
-
     def touching(self) -> dict[tuple[int, int], float]:
         """Map each pair of bodies of different things in contact to their deepest gap in m, which is negative or 0."""
         contact = self.data.contact
@@ -96,6 +90,12 @@ class CompiledScene:
         for (first, second), gap_m in zip(bodies[touching].tolist(), contact.dist[touching].tolist(), strict=True):
             gaps[first, second] = min(gaps.get((first, second), 0.0), gap_m)
         return gaps
+
+
+def contacts(data: mujoco.MjData) -> NDArray[np.intp]:
+    """Return the pairs (C, 2) of bodies in contact in a restored scene."""
+    contact = data.contact
+    return np.asarray(data.model.geom_bodyid[contact.geom[contact.dist <= 0]], np.intp)
 
 
 def simulate_held(model: mujoco.MjModel, data: mujoco.MjData, held: Joints, seconds: float) -> None:

@@ -3,6 +3,7 @@
 A trajectory has a folder, and in it a file for each set of streams that were rendered together.
 """
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -21,9 +22,9 @@ from pipeline.identity import MAPS_RECIPE
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import SUFFIX, Store
-from pipeline.types import Geometry, Jpeg, Quality, Rendered
+from pipeline.types import Geometry, Jpeg, Quality, Rendered, Subtask
 
-_OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
+_OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses", "boxes"}
 """Parts of the schema that describe the content of a store's files."""
 
 
@@ -32,24 +33,28 @@ class StoredFrames:
     """Record of one trajectory's stored frames, in all its files.
 
     Attributes:
-        made_by, device, replay_mode: values of the table's columns.
+        made_by, device, replay_mode, actions_sha256: values of the table's columns.
         streams: ids of the rendered streams.
         rejected: id of each rejected stream to the reason.
+        subtasks: subtasks of the trajectory; empty without rendered streams.
     """
 
     made_by: str
     device: str
     replay_mode: str
+    actions_sha256: str
     streams: set[str] = field(default_factory=set)
     rejected: dict[str, str] = field(default_factory=dict)
+    subtasks: Sequence[Subtask] = ()
 
 
 class FrameStore(Store):
     """Frames under one folder.
 
-    The columns of its table are ``device`` (OpenGL name of the device that rendered), ``replay_mode``, ``steps`` and
-    ``streams`` (ids of the rendered streams). The column ``rejected`` is JSON, the id of each rejected stream to the
-    reason. A file's name is ``<trajectory id>/<digest of its streams>``.
+    The columns of its table are ``device`` (OpenGL name of the device that rendered), ``replay_mode``, ``steps``,
+    ``actions_sha256`` (of the stored actions) and ``streams`` (ids of the rendered streams). Two columns are JSON:
+    ``rejected``, the id of each rejected stream to the reason, and ``subtasks``, pairs of step and text. A file's name
+    is ``<trajectory id>/<digest of its streams>``.
 
     Frames that were encoded with another ``render_config`` count as missing. Further views are streams of their own.
     """
@@ -59,20 +64,25 @@ class FrameStore(Store):
         "device": pa.string(),
         "replay_mode": pa.string(),
         "steps": pa.int64(),
+        "actions_sha256": pa.string(),
         "streams": pa.list_(pa.string()),
         "rejected": pa.string(),
+        "subtasks": pa.string(),
     }
 
     def __init__(self, root: Path, render_config: RenderConfig):
         schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*render_config.extras} else {}
+        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS, "boxes"} & {*render_config.extras} else {}
         settings = render_config.model_dump(mode="json", exclude={"views"})
         super().__init__(root, settings, {"episode schema": schema, **maps})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
-        attributes = {name: file.attributes[name] for name in ("device", "replay_mode", "rejected")}
-        return {**attributes, "steps": len(file.array("action")), "streams": _members(file, "streams")}
+        attributes = {name: file.attributes[name] for name in ("device", "replay_mode", "rejected", "subtasks")}
+        action = file.array("action")
+        actions_sha256 = hashlib.sha256(action.tobytes()).hexdigest()
+        streams = _members(file, "streams")
+        return {**attributes, "steps": len(action), "actions_sha256": actions_sha256, "streams": streams}
 
     def folder(self, trajectory_id: str) -> Path:
         return self.root / trajectory_id
@@ -89,6 +99,7 @@ class FrameStore(Store):
             "instances": list(rendered.instances),
             "rejected": json.dumps(dict(rendered.rejected), sort_keys=True),
             "quality": asdict(rendered.quality) if rendered.quality else None,
+            "subtasks": json.dumps(list(rendered.subtasks)),
         }
         arrays: dict[str, NDArray[Any]] = {
             "state": rendered.state,
@@ -103,6 +114,8 @@ class FrameStore(Store):
             arrays |= {f"{view}/{name}": getattr(geometry, name) for name in MATRICES}
             for extra, files in geometry.maps.items():
                 arrays |= _packed(f"{view}/{extra}", files)
+            if geometry.boxes is not None:
+                arrays[f"{view}/boxes"] = geometry.boxes
         if rendered.object_poses is not None:
             arrays["object_poses"] = rendered.object_poses
         self.write(file_name(trajectory_id, {*rendered.streams, *rendered.rejected}), arrays, attributes)
@@ -202,10 +215,18 @@ def frames_by_trajectory(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Sto
     for name, row in rows.items():
         trajectory_id = name.split("/")[0]
         if trajectory_id not in stored:
-            stored[trajectory_id] = StoredFrames(row["made_by"], row["device"], row["replay_mode"])
+            stored[trajectory_id] = StoredFrames(
+                row["made_by"], row["device"], row["replay_mode"], row["actions_sha256"]
+            )
         stored[trajectory_id].streams.update(row["streams"])
         stored[trajectory_id].rejected.update(json.loads(row["rejected"]))
+        if row["streams"]:  # A file of lost workers alone has no subtasks.
+            stored[trajectory_id] = replace(stored[trajectory_id], subtasks=_subtasks(row["subtasks"]))
     return stored
+
+
+def _subtasks(text: str) -> tuple[Subtask, ...]:
+    return tuple(Subtask(step, text) for step, text in json.loads(text))
 
 
 def merged(parts: Sequence[Rendered]) -> Rendered:
@@ -240,6 +261,7 @@ def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[s
         object_poses=file.array("object_poses") if "object_poses" in file.checksums else None,
         instances=file.attributes["instances"],
         quality=Quality(**quality) if quality else None,
+        subtasks=_subtasks(file.attributes["subtasks"]),
     )
 
 
@@ -257,7 +279,8 @@ def _packed(parent: str, files: Sequence[bytes]) -> dict[str, NDArray[Any]]:
 def _geometry(file: SealedFile, view: str) -> Geometry:
     matrices = {name: file.array(f"{view}/{name}") for name in MATRICES}
     maps = {name: _unpacked(file, f"{view}/{name}") for name in MAPS if f"{view}/{name}/bytes" in file.checksums}
-    return Geometry(**matrices, maps=maps)
+    boxes = file.array(f"{view}/boxes") if f"{view}/boxes" in file.checksums else None
+    return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
 def _unpacked(file: SealedFile, parent: str) -> list[bytes]:

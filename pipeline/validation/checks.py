@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
-from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
-from pipeline.formats.read_back import Copy, Fault
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, label_faults, labels_of
+from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_numbers, wrong_pixels, wrong_sample
+from pipeline.libero import bddl
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.types import Frame
@@ -145,6 +146,20 @@ def _language_entries(case: Case, train: bool) -> list[tuple[str, str, str, np.f
     return entries
 
 
+def labels(case: Case) -> Iterator[Fault]:
+    """Check the subtasks and rewrites of the manifest, and compare all copies with the manifest."""
+    stated = {name: case.row[name] for name in SCHEMA.labels}
+    if None in stated.values():
+        yield case.finding("manifest", "has no subtasks and rewrites", "lists, which may be empty")
+        return
+    for what, expected in label_faults(stated, len(case.made)):
+        yield case.finding("manifest", what, expected)
+    for dataset, episode in (("frames", case.made), *((copy.dataset, copy.episode) for copy in case.copies)):
+        for name, stored in labels_of(episode).items():
+            if stored != stated[name]:
+                yield case.finding(dataset, f"{name} is {stored}", stated[name])
+
+
 def wording(case: Case) -> Iterator[Fault]:
     """Check that the instruction is the task's or the sampled rewrite of the bank, without parts of a file's name."""
     task, text = find_task(case.row["suite"], case.row["task"]), case.row["instruction"]
@@ -202,10 +217,47 @@ def geometry(case: Case) -> Iterator[Fault]:
             for name, files in made.maps.items():
                 if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
+            if not _same(copy.episode.geometry[view].boxes, made.boxes):
+                yield case.finding(copy.dataset, f"{view}_boxes differ", "the stored boxes")
         if not _same(copy.episode.object_poses, case.made.object_poses):
             yield case.finding(copy.dataset, "object_poses differ", "the stored poses")
         if list(copy.episode.instances) != list(case.made.instances):
             yield case.finding(copy.dataset, f"instances {list(copy.episode.instances)}", list(case.made.instances))
+
+
+def boxes(case: Case) -> Iterator[Fault]:
+    """Compare the stored boxes with the masks of the same steps, if both are stored.
+
+    The gripper and the things with a box must be seen where the box is; other things of the goal must not be seen.
+    """
+    places = [GRIPPER, *_goal_places(case)]
+    for view, made in case.made.geometry.items():
+        if made.boxes is None or "segmentation" not in made.maps:
+            continue
+        for step in sampled(len(case.made)):
+            ids = cv2.imdecode(np.frombuffer(made.maps["segmentation"][step], np.uint8), cv2.IMREAD_UNCHANGED)
+            expected = np.zeros_like(made.boxes[step])
+            for place in places:
+                # OpenCV's rectangle has the first column and row, and the numbers of columns and rows.
+                expected[place] = cv2.boundingRect((ids == place).astype(np.uint8))
+            wrong = np.flatnonzero(np.any(expected != made.boxes[step], axis=1))
+            if len(wrong):
+                what = f"{view}_boxes of step {step} has {made.boxes[step][wrong[0]].tolist()} at place {wrong[0]}"
+                yield case.finding("frames", what, expected[wrong[0]].tolist())
+                break
+
+
+GRIPPER = 2
+"""Place of the gripper in every table of instances."""
+
+
+def _goal_places(case: Case) -> list[int]:
+    """List the places in ``instances`` of the things that the task's goal names."""
+    problem = bddl.read(find_task(case.row["suite"], case.row["task"]).bddl_file)
+    named_things: set[str] = set()
+    for fact in problem.goal:
+        named_things.update(problem.things_named(fact[1:]))
+    return [place for place, name in enumerate(case.made.instances) if name in named_things]
 
 
 def video(case: Case) -> Iterator[Fault]:
@@ -332,6 +384,8 @@ def _listed(place: Mapping[str, Any]) -> str:
 
 Check = Callable[[Case], Iterable[Fault]]
 
-_EVERY = (length, motion, instruction, wording, provenance, place, jpeg, geometry, video, cameras, alive, gripper)
-CHECKS: Mapping[str, Check] = {check.__name__: check for check in (*_EVERY, flags, clock, statistics)}
+_LABELS = (length, motion, instruction, labels, wording, provenance, place)
+_PICTURES = (jpeg, geometry, boxes, video, cameras, alive)
+_EVERY = (*_LABELS, *_PICTURES, gripper, flags, clock, statistics)
+CHECKS: Mapping[str, Check] = {check.__name__: check for check in _EVERY}
 """Name to check."""

@@ -37,8 +37,8 @@ JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
 """A frame, by quality."""
 MAP_KB: dict[Extra, float] = {"depth": 31.0, "segmentation": 3.0}
 """A view of one step."""
-POSES_KB, MOTION_KB = 0.7, 0.5
-"""One step: object poses; state, action and all other columns except the frames."""
+POSES_KB, BOXES_KB, MOTION_KB = 0.7, 0.8, 0.5
+"""One step: object poses; boxes of both views; state, action and all other columns except the frames."""
 TRAJECTORY_KB, STATE_KB = 100.0, 1.2
 """A trajectory, and each step of it."""
 EPISODE_KB = 50.0
@@ -52,7 +52,7 @@ PUBLISHED = 50
 SHADOWS_S, SHADOWS = 0.13, 0.4
 """Time that shadows add to a frame, and the share of the light episodes that have them."""
 MAPS_S = 0.045
-"""Depth, segmentation, or both, of a view of one step: a second rendering, and PNG files."""
+"""Depth, segmentation, boxes, or all of them, of a view of one step: a second rendering, and PNG files."""
 VALIDATE_S = 0.0006
 """A step of an episode in ``validate``."""
 FIXED_S = 100.0
@@ -83,7 +83,7 @@ def needed_mb(config: Config) -> dict[str, float]:
         maps += number * _changed_views([kind for kind in kinds if _seen_otherwise(kind)], content.views)
     frame_kb = content.area * float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
     map_kb = content.area * sum(MAP_KB[extra] for extra in content.extras if extra in MAP_KB)
-    poses_kb = POSES_KB if "object_poses" in content.extras else 0.0
+    poses_kb = POSES_KB * ("object_poses" in content.extras) + BOXES_KB * ("boxes" in content.extras)
 
     needed_kb = {
         "trajectories": (twins + trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
@@ -119,7 +119,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     frame_s = [agent_s, wrist_s, *[agent_s] * (len(content.views) - 2)]
     if speed.gpus:
         frame_s = [_gpu_frame_s(config.compute, speed)] * len(content.views)
-    maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in content.extras)
+    maps_s = MAPS_S * slower * bool({*MAP_KB, "boxes"} & {*content.extras})
     trajectories, rendered_s = amounts.twins, amounts.twin_steps * sum(view_s + maps_s for view_s in frame_s)
     encoded_s = amounts.twin_steps * len(frame_s) * ENCODE_S
     for episodes, kinds in _planned(config.plan):

@@ -134,7 +134,7 @@ def _rebuild(
     rejected = frames_by_trajectory(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected
     if rejected:
         return None, next(iter(rejected.values()))
-    load = EpisodeLoader(out, settings.render)
+    load = EpisodeLoader(out, settings.render, rewrites={row["episode_id"]: row["rewrites"]})
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), content)
     export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")

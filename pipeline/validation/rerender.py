@@ -16,6 +16,8 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import encode
+from pipeline.libero.tasks import find_task
+from pipeline.physics.subtasks import subtasks as find_subtasks
 from pipeline.rendering.renderer import LastScene
 from pipeline.types import Frame
 from pipeline.validation.case import Case
@@ -64,6 +66,13 @@ def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iter
                     what = f"{name} is another file than a fresh rendering, {reached_db:.1f} dB apart"
                     expected = f"the same file, because {case.row['gl_device']} rendered both"
                     yield case.finding(seen.dataset, what, expected)
+
+
+def subtasks(case: Case) -> Iterator[Fault]:
+    """Compare the stored subtasks with those that follow from the states of the replay alone."""
+    expected = find_subtasks(case.trajectory, find_task(case.row["suite"], case.row["task"]))
+    if tuple(case.made.subtasks) != expected:
+        yield case.finding("frames", f"subtasks {list(case.made.subtasks)}", list(expected))
 
 
 def _nearest(

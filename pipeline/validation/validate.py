@@ -36,7 +36,7 @@ from pipeline.run.layout import COUNTS, STATISTICS, WORK
 from pipeline.run.run import Run
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
-from pipeline.validation.rerender import rendered, witnesses
+from pipeline.validation.rerender import rendered, subtasks, witnesses
 
 WHOLE = 4
 """Number of re-rendered episodes of which all frames are decoded, for the statistics of their views."""
@@ -221,10 +221,8 @@ class EpisodesJob:
     of_failures: bool = False
 
     def __call__(self, rows: Sequence[Row]) -> Results:
-        results, rewrites = Results(), None
-        if any(dataset.language for dataset in self.formats):
-            language = self.run.config.plan.axes.language
-            rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
+        results, language = Results(), self.run.config.plan.axes.language
+        rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
         load = self.run.episodes(failures=self.of_failures, rewrites=rewrites)
         for row in rows:
             self._check(row, load, results)
@@ -263,3 +261,4 @@ class EpisodesJob:
             results.note(name, check(case))
         if episode_id in self.witnesses:
             results.note("rendered", rendered(case, self.run.config.render, scene_of_process()))
+            results.note("subtasks", subtasks(case))

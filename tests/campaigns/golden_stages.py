@@ -13,7 +13,7 @@ import numpy as np
 from conftest import STOVE
 from synthetic import IDS, episode, files, write_format, write_lerobot, write_lerobot_v21, write_rlds
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, labels_of
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
@@ -100,6 +100,7 @@ def checks() -> dict[str, Any]:
     )
     row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
     row |= {"kept": True, "steps": steps + 1, "place": 1, "instruction": "task_1"}
+    row |= labels_of(made)
     view, second_view = SCHEMA.views
     decoded = {(name, t): decode(made.frames[name][t]) for name, t in product(SCHEMA.views, sampled(steps))}
     swapped = {(view, t): decoded[second_view, t] for t in sampled(steps)}

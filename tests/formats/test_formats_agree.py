@@ -124,6 +124,8 @@ def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
             assert {view: seen.maps for view, seen in copy.episode.geometry.items()} == {
                 view: seen.maps for view, seen in source.geometry.items()
             }
+            for view, seen in source.geometry.items():
+                np.testing.assert_array_equal(copy.episode.geometry[view].boxes, seen.boxes)
         shard, place = row["rlds_shard"], row["rlds_index"]
         record = list(records(rlds.folder / SET / "1.0.0" / shard))[place]
         before = columns(list(records(written.version / shard))[place], plain)

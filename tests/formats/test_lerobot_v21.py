@@ -98,5 +98,6 @@ def test_v21_does_not_depend_on_workers_and_keeps_extras(convention: str, tmp_pa
         assert copy is not None
         np.testing.assert_array_equal(copy.episode.action, source.action)
         np.testing.assert_array_equal(copy.episode.object_poses, source.object_poses)
+        np.testing.assert_array_equal(copy.episode.geometry["image"].boxes, source.geometry["image"].boxes)
         assert copy.episode.geometry["image"].maps["depth"] == list(source.geometry["image"].maps["depth"])
         np.testing.assert_array_equal(copy.episode.geometry["image"].extrinsics, source.geometry["image"].extrinsics)

@@ -50,6 +50,9 @@ def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
         for view, seen in source.geometry.items():
             np.testing.assert_array_equal(metadata.pop(f"{view}_intrinsics"), seen.intrinsics)
             np.testing.assert_array_equal(metadata.pop(f"{view}_extrinsics"), seen.extrinsics)
+        starts, described = metadata.pop("subtask_starts"), metadata.pop("subtask_texts")
+        assert list(zip(starts.tolist(), described.tolist(), strict=True)) == [*source.subtasks]
+        assert metadata.pop("rewrites").tolist() == [*source.rewrites]
         texts = {name: str(text) for name, text in metadata.items() if name != "instances"}
         said = {name: str(value) for name, value in source.provenance.items()}
         assert texts == {"file_path": said["demo_source"], **said}

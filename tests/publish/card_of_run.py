@@ -51,6 +51,7 @@ def row(axis: str, *changes: Perturbation, task: Task = MILK, reason: str = "kep
         "chosen": True,
         "replay_mode": "open_loop",
         "steps": 100,
+        "actions_sha256": "tracked" if other.get("replay_mode") == "tracked" else f"recorded {task.name}",
         "gl_device": "llvmpipe" if kept else None,
         "rlds_shard": f"{NAME}-train.tfrecord-00000-of-00001" if kept else None,
         "mujoco_version": "3.2.7",

@@ -73,6 +73,13 @@ def test_tables_say_what_the_manifest_says(data: Path) -> None:
     assert re.search(rf"regenerate ({'|'.join(row['episode_id'] for row in ROWS if row['kept'])}) --manifest", text)
 
 
+def test_distinct_action_sequences_are_counted_by_task(data: Path) -> None:
+    text = written(data, "rlds")
+    assert cells(text, str(MILK), "Diversity") == ["5", "2", "4"]
+    assert cells(text, str(STOVE), "Diversity") == ["2", "1", "2"]
+    assert cells(text, "**all**", "Diversity") == ["7", "3", "6"]
+
+
 def test_what_is_left_out_is_not_lost(data: Path) -> None:
     """Nor is what failed of the same kind, also where all of it did."""
     before = written(data, "rlds")

@@ -41,7 +41,7 @@ from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 
-EXTRAS: tuple[RenderedExtra, ...] = ("depth", "object_poses", "segmentation")
+EXTRAS: tuple[RenderedExtra, ...] = ("boxes", "depth", "object_poses", "segmentation")
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
 DIM = LightPerturbation(component="diffuse", level=1, diffuse_scale_rgb=(0.9, 0.9, 0.9))
 STREAMS = {
@@ -108,6 +108,21 @@ def test_depth_leads_to_the_things_that_the_pixels_are_of(name: str, rendered: R
         if name != "wrist_image":
             assert np.linalg.norm((points_m[shown].mean(axis=0) - pose[:3])[:2]) < 0.02, thing
     assert {"akita_black_bowl_1", "cream_cheese_1", "plate_1"} <= looked_at
+
+
+def test_boxes_are_the_least_around_the_pixels_of_the_gripper_and_the_goal(rendered: Rendered) -> None:
+    knob = rendered.instances.index("flat_stove_1")
+    for name in ("image", "wrist_image"):
+        geometry = rendered.geometry[STREAMS[name].geometry.stream_id]
+        assert geometry.boxes is not None
+        for ids, boxes in zip(map(pixels, geometry.maps["segmentation"]), geometry.boxes, strict=True):
+            assert set(np.flatnonzero(boxes.any(axis=1))) <= {rendered.instances.index("gripper"), knob}
+            for place in (rendered.instances.index("gripper"), knob):
+                x, y, width, height = boxes[place].astype(int)
+                inside = ids[y : y + height, x : x + width] == place
+                assert inside.sum() == (ids == place).sum() > 0
+                edges = (inside[0], inside[-1], inside[:, 0], inside[:, -1])
+                assert all(edge.any() for edge in edges), "no smaller box has all of them"
 
 
 def test_streams_that_differ_in_colours_share_their_geometry(rendered: Rendered) -> None:
@@ -216,6 +231,7 @@ def test_both_datasets_have_what_the_store_has(run: Path) -> None:
     for case in found:
         assert [copy.dataset for copy in case.copies] == ["rlds", "lerobot"]
         assert list(CHECKS["geometry"](case)) == []
+        assert list(CHECKS["boxes"](case)) == []
         last = pixels(case.made.geometry["image"].maps["segmentation"][-1])
         shown = {case.made.instances[place] for place in np.unique(last).tolist()}
         assert {"robot", "gripper", "table", "wall", "plate_1", "wooden_cabinet_1"} <= shown
@@ -232,15 +248,31 @@ def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:
     made = copy.episode
     seen = made.geometry["image"]
     assert made.object_poses is not None
+    assert seen.boxes is not None
     for spoilt, what in (
         (replace(made, geometry={**made.geometry, "image": replace(seen, extrinsics=seen.extrinsics.T)}), "image_ext"),
         (replace(made, geometry={**made.geometry, "image": made.geometry["wrist_image"]}), "image_"),
         (replace(made, object_poses=made.object_poses[::-1]), "object_poses"),
+        (replace(made, geometry={**made.geometry, "image": replace(seen, boxes=seen.boxes + 1)}), "image_boxes"),
         (replace(made, instances=made.instances[:-1]), "instances"),
     ):
         findings = list(CHECKS["geometry"](replace(case, copies=[replace(copy, episode=spoilt)])))
         assert findings
         assert {finding.what.startswith(what) for finding in findings} == {True}
+
+
+@pytest.mark.parametrize("view", ["image", "wrist_image"])
+def test_a_box_that_is_not_around_its_mask_is_a_finding(view: str, run: Path) -> None:
+    case = cases(run)[0]
+    seen = case.made.geometry[view]
+    assert seen.boxes is not None
+    shifted = seen.boxes.copy()
+    place = case.made.instances.index("gripper")
+    shifted[0, place, 0] += 1
+    spoilt = replace(case.made, geometry={**case.made.geometry, view: replace(seen, boxes=shifted)})
+    (finding,) = CHECKS["boxes"](replace(case, made=spoilt))
+    assert finding.what.startswith(f"{view}_boxes of step 0 has ")
+    assert finding.what.endswith(f"at place {place}")
 
 
 def test_the_example_runs_on_it(run: Path) -> None:

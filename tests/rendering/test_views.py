@@ -20,7 +20,7 @@ from pipeline.rendering.render import render
 from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import Sight
 from pipeline.run.run import Run
-from pipeline.types import Frame, Task, Trajectory
+from pipeline.types import Frame, Jpeg, Task, Trajectory
 
 CAMERAS = [view.camera for view in ALL_VIEWS.values()]
 SIZES_PX = {"tabletop": 64, "floor": 130, "kitchen": 384, "living_room": 512, "study": 256}
@@ -185,7 +185,7 @@ def test_a_run_of_small_frames_with_a_further_view(short_demos: Path, tmp_path: 
     assert "`observation.images.front` from the camera frontview" in readme
 
 
-def frames_of(folder: Path, config: dict[str, object]) -> dict[str, dict[str, list[bytes]]]:
+def frames_of(folder: Path, config: dict[str, object]) -> dict[str, dict[str, list[Jpeg]]]:
     """Return the stored frames of every kept episode by view."""
     opened = Run(Config.model_validate({**config, "folder": folder / "data"}))
     load, stored = opened.episodes(), {}

@@ -24,7 +24,7 @@ def row(name: str, axis: str, steps: int | None, **other: Any) -> dict[str, Any]
     known = {"suite": BOWL.suite, "task": BOWL.name, "chosen": True, "kept": True, "reason": "kept"}
     known |= {"perturbations": "[]", "replay_mode": "open_loop", "instruction": BOWL.instruction}
     role = "twin" if axis == "clean" else "perturbed"
-    ids = {"episode_id": name, "trajectory_id": name, "twin_id": "twin"}
+    ids = {"episode_id": name, "trajectory_id": name, "twin_id": "twin", "actions_sha256": f"actions of {name}"}
     return {**known, **ids, "axis": axis, "role": role, "steps": steps, **other}
 
 
@@ -35,10 +35,28 @@ TRACKED = row("tracked", "robot", 2980, replay_mode="tracked", task="another")
 
 def test_the_headline_is_of_what_is_kept() -> None:
     assert report._headline([TWIN, PUSHED, LOST, TRACKED], [TWIN, PUSHED, TRACKED]) == {
-        **{"planned": "4", "replayed": "4", "kept": "3", "kept clean twins": "1", "tasks": "2"},
+        **{
+            "planned": "4",
+            "replayed": "4",
+            "kept": "3",
+            "kept clean twins": "1",
+            "action sequences": "3",
+            "tasks": "2",
+        },
         # 9,100 steps of 50 ms.
         **{"steps": "9,100", "minutes at 20 Hz": "8"},
     }
+
+
+def test_action_sequences_are_counted_by_task() -> None:
+    shown = row("shown", "camera", 3000, actions_sha256=TWIN["actions_sha256"])
+    table = yields.by_task([TWIN, shown, PUSHED, TRACKED])
+    assert table.head == ("task", "episodes", "distinct sequences", "as recorded")
+    assert [[cell.text for cell in line] for line in table.rows] == [
+        [f"{BOWL.suite}/another", "1", "1", "0"],
+        [str(BOWL), "3", "2", "3"],
+        ["all", "4", "3", "3"],
+    ]
 
 
 def test_drop_reasons_are_of_what_is_lost_and_replay_modes_of_what_is_kept() -> None:

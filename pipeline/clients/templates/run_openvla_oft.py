@@ -22,6 +22,10 @@ multiplies each weight by the dataset's number of steps. The datasets of this ru
 
     --data_root_dir MIX --mix libero_goal_no_noops=1 --mix libero_10_no_noops=0.5
 
+Each training sample gets one of its episode's rewrites in place of the instruction, with the probability
+``rewrite_probability`` of the settings. It is 0 if the run's configuration does not set it; ``--rewrite_probability P``
+overrides it. Validation and LIBERO's own datasets keep their instructions.
+
 OFT's evaluation reads one entry of statistics per suite, ``libero_goal``. It reads ``libero_goal_no_noops`` only if
 ``libero_goal`` is missing. Therefore all datasets of a suite get equal statistics: the statistics of ``--statistics``,
 else those of the suite's first dataset. The first is a dataset of this run if the run has the suite. LIBERO's datasets
@@ -30,6 +34,7 @@ have no split ``val``: leave out ``--use_val_set True``.
 OFT has no flags for the following settings, so this script applies them:
 
 * The datasets and their mixture are registered.
+* The rewrites of an episode pass through OFT's loader together with the instruction, and one is sampled per sample.
 * AdamW gets the settings' weight decay (OFT leaves PyTorch's 0.01).
 * A cosine with warm-up replaces OFT's step, because OFT's own warm-up would undo any later decay.
 * The statistics of a checkpoint are stored under suite names too, because OFT's evaluation looks them up by suite.
@@ -40,10 +45,12 @@ import argparse
 import importlib
 import json
 import math
+import os
+import random
 import re
 import runpy
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,6 +93,80 @@ def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, fl
                 "state_encoding": configs.StateEncoding.POS_EULER,
                 "action_encoding": configs.ActionEncoding.EEF_POS,
             }
+
+
+class SampledRewrites:
+    """A transform of OFT's samples that first replaces the instruction by one of the episode's rewrites.
+
+    Args:
+        transform: OFT's own transform of a sample.
+        probability: probability of a replacement.
+        key: key of the samples' random choices.
+    """
+
+    def __init__(self, transform: Callable[[dict[str, Any]], Any], probability: float, key: str) -> None:
+        self.transform = transform
+        self.probability = probability
+        self.generator = random.Random(key)
+
+    def __call__(self, sample: dict[str, Any]) -> Any:
+        """Transform a sample whose text has the instruction in the first line, and a rewrite in each further line."""
+        instruction, *rewrites = sample["task"]["language_instruction"].split(b"\n")
+        if rewrites and self.generator.random() < self.probability:
+            instruction = self.generator.choice(rewrites)
+        task = {**sample["task"], "language_instruction": instruction}
+        return self.transform({**sample, "task": task})
+
+
+def sample_rewrites(datasets: Collection[str], probability: float, key: str) -> None:
+    """Make OFT's loader pass the rewrites of these datasets on, and sample one for each training sample.
+
+    OFT's loader keeps no metadata of an episode but the instruction of each step. Therefore the instruction and the
+    rewrites pass through the loader as the lines of one text.
+
+    Args:
+        datasets: datasets that ``register`` has registered.
+        probability: probability of a replacement; 0 in validation.
+        key: key of the samples' random choices.
+    """
+    tf: Any = importlib.import_module("tensorflow")
+    transforms = importlib.import_module(f"{DATASETS}.oxe.transforms")
+
+    # OFT names its stored statistics after the source text of this function.
+    def with_rewrites(trajectory: dict[str, Any]) -> dict[str, Any]:
+        # OFT's reader repeats each entry of the metadata for every step.
+        rewrites = trajectory["traj_metadata"]["episode_metadata"]["rewrites"]
+        rows = tf.reshape(rewrites, [-1, tf.shape(trajectory["action"])[0]])
+        lines = tf.concat([trajectory["language_instruction"][None], rows], axis=0)
+        text = tf.strings.reduce_join(lines, axis=0, separator="\n")
+        return {**transforms.libero_dataset_transform(trajectory), "language_instruction": text}
+
+    for dataset in datasets:
+        transforms.OXE_STANDARDIZATION_TRANSFORMS[dataset] = with_rewrites
+    package: Any = importlib.import_module(DATASETS.rpartition(".")[0])
+    loader = package.RLDSDataset
+
+    class RLDSDataset(loader):  # type: ignore[misc, valid-type]
+        def __init__(self, root: Path, mix: str, transform: Any, *words: Any, train: bool = True, **options: Any):
+            sampled = SampledRewrites(transform, probability if train else 0.0, key)
+            super().__init__(root, mix, sampled, *words, train=train, **options)
+
+    package.RLDSDataset = RLDSDataset
+
+
+def probability_of(text: str) -> float:
+    """Parse a probability.
+
+    Raises:
+        argparse.ArgumentTypeError: if the text is no number from 0 to 1.
+    """
+    try:
+        probability = float(text)
+    except ValueError:
+        probability = math.nan
+    if not 0 <= probability <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a probability from 0 to 1")
+    return probability
 
 
 def name_statistics_by_suite(suites: Mapping[str, str]) -> None:
@@ -258,6 +339,8 @@ def prepare() -> None:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--statistics", type=Path)
     parser.add_argument("--mix", type=mixed, action="append", default=[])
+    rewrite_probability = training.get("rewrite_probability", {"value": 0.0})["value"]
+    parser.add_argument("--rewrite_probability", type=probability_of, default=rewrite_probability)
     options, given = parser.parse_known_args()
     added, suites = dict(options.mix), dataset["suites"]["value"]
     suite_of = {name: suite for suite, name in suites.items()}
@@ -269,6 +352,9 @@ def prepare() -> None:
     # If a flag is given twice, its last value counts. OFT's own warm-up would undo the cosine, so it is set to 0.
     sys.argv = [SCRIPT, *arguments(recipe), *given, "--lr_warmup_steps", "0"]
     register(dataset["mixtures"]["value"], added)
+    if options.rewrite_probability:
+        key = f"process {os.environ.get('RANK', '0')}, from step {schedule.first}"
+        sample_rewrites({*suites.values()}, options.rewrite_probability, key)
     name_statistics_by_suite(suites)
     former = statistics_of(options.statistics, dict.fromkeys(suite_of.values())) if options.statistics else {}
     set_statistics(dataset["sha256"]["value"], suite_of, former)

@@ -67,8 +67,8 @@ def _keys(convention: Convention, content: Content) -> dict[str, str]:
     """Return the ``keys`` of a format under the names of v3.0."""
     keys = {view: spec.lerobot_key for view, spec in content.cameras.items()} | convention.motion_keys
     for view in content.views:
-        keys |= {f"{view}_{name}": camera_column(view, name) for name in (*MATRICES, *MAPS)}
-    return keys | {"provenance": "meta/provenance.parquet"}
+        keys |= {f"{view}_{name}": camera_column(view, name) for name in (*MATRICES, *MAPS, "boxes")}
+    return keys | {"provenance": "meta/provenance.parquet", "labels": "meta/episodes"}
 
 
 class LeRobot(Format[LeRobotConfig]):
@@ -78,10 +78,9 @@ class LeRobot(Format[LeRobotConfig]):
     title: ClassVar = "LeRobot"
     options_type: ClassVar = LeRobotConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 9
+    recipe: ClassVar = 10
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = "lerobot"
-    rewrites_instructions: ClassVar = True
     step_s: ClassVar = 0.0015
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
@@ -242,7 +241,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     name: ClassVar = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
     options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
-    recipe: ClassVar = 4
+    recipe: ClassVar = 5
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     group: ClassVar = LeRobot.group
     step_s: ClassVar = LeRobot.step_s
@@ -253,6 +252,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
         super().__init__(data, options, content)
         self.convention = CONVENTIONS[options.convention]
         self.keys = {name: self.convention.name(key) for name, key in _keys(self.convention, content).items()}
+        self.keys["labels"] = "meta/episodes.jsonl"
         if self.convention.open_is_one:
             self.gripper = GripperSpec(open=1.0, close=0.0)
         self.clients = CLIENTS_V21[options.convention]

@@ -332,7 +332,8 @@ def _format_v21(root: Path, convention: Convention, content: Content) -> Iterato
     read = {"episode_index": [line.get("episode_index") for line in lines]}
     read["fields of episodes.jsonl"] = sorted({tuple(sorted(line)) for line in lines})
     expected = {"episode_index": [*range(len(rows))]}
-    expected["fields of episodes.jsonl"] = [("episode_id", "episode_index", "length", "tasks")]
+    fields = ("episode_id", "episode_index", "length", "tasks", *SCHEMA.labels)
+    expected["fields of episodes.jsonl"] = [tuple(sorted(fields))]
     yield from unlike(dataset, read, expected, within)
     yield from _wrong_tasks(dataset, tasks, [row["tasks"][0] for row in rows.values()])
     if convention.open_is_one:

@@ -97,9 +97,10 @@ def video_path_v21(index: int, key: str) -> str:
 
 
 def camera_column(view: str, name: str) -> str:
-    """Return the column with a view's matrix or map.
+    """Return the column with a view's matrix, map or boxes.
 
-    A matrix is stored row by row in ``meta/provenance.parquet``, a map as PNG in base64 in every frame. Maps are text,
+    A matrix is stored row by row in ``meta/provenance.parquet``, a map as PNG in base64 in every frame, and boxes as
+    numbers, row by row, in every frame. Maps are text,
     and no name begins with ``observation``, because lerobot's policies use such columns and all images as inputs.
     """
     return f"{ALL_VIEWS[view].lerobot_camera}.{name}"
@@ -185,6 +186,8 @@ class Convention:
             columns[key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
         columns[EPISODE_ID] = dict(text)
         columns |= {camera_column(view, name): dict(text) for view in content.views for name in content.maps}
+        if "boxes" in content.extras:
+            columns |= {camera_column(view, "boxes"): _flat(SCHEMA.boxes) for view in content.views}
         if "object_poses" in content.extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
         if self.language:

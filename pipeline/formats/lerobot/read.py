@@ -30,7 +30,7 @@ from pipeline.formats.lerobot.columns import (
     matrix,
     video_path_v21,
 )
-from pipeline.formats.read_back import Copy, Statistics, sampled
+from pipeline.formats.read_back import Copy, Statistics, sampled, subtasks_of
 from pipeline.formats.stated_statistics import QUANTILES
 from pipeline.types import Episode, Frame, Geometry
 
@@ -195,7 +195,7 @@ def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
 def episode(
     table: pa.Table, row: Mapping[str, Any], instruction: str, content: Content, convention: Convention
 ) -> Episode:
-    """Return an episode, given v3.0's columns of its steps and its row of ``meta/provenance.parquet``.
+    """Return an episode, given v3.0's columns of its steps and its row of the files in ``meta/``.
 
     The episode has frames only where they are stored as image files.
     """
@@ -216,6 +216,8 @@ def episode(
         geometry={view: _geometry(table, row, view, content) for view in content.views},
         object_poses=_object_poses(table) if "object_poses" in content.extras else None,
         instances=json.loads(row[INSTANCES]) if content.has_names else (),
+        rewrites=row["rewrites"],
+        subtasks=subtasks_of(row["subtask_starts"], row["subtask_texts"]),
     )
 
 
@@ -248,7 +250,10 @@ def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, content: Conte
         matrices[name] = numbers.reshape(getattr(SCHEMA, name).shape)
     texts = {name: table[camera_column(view, name)].to_pylist() for name in content.maps}
     maps = {name: list(map(base64.b64decode, files)) for name, files in texts.items()}
-    return Geometry(**matrices, maps=maps)
+    boxes = None
+    if "boxes" in content.extras:
+        boxes = matrix(table, camera_column(view, "boxes")).reshape(-1, *SCHEMA.boxes.shape)
+    return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
 def decoded(times_s: Sequence[float], videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:

@@ -33,7 +33,7 @@ import pyarrow.parquet as pq
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, STANDARD, Content, check
+from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, STANDARD, Content, check, labels_of
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, listed, of_levels, open_is_one
@@ -209,6 +209,9 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, conven
     numbers: dict[str, NDArray[Any]] = {key: getattr(episode, name) for name, key in convention.motion_keys.items()}
     if episode.object_poses is not None:
         numbers[OBJECT_POSES] = episode.object_poses.reshape(len(steps), -1)
+    for view, geometry in episode.geometry.items():
+        if geometry.boxes is not None:
+            numbers[camera_column(view, "boxes")] = geometry.boxes.reshape(len(steps), -1)
     return numbers | {
         "timestamp": (steps / SCHEMA.fps_hz).astype(np.float32),
         "frame_index": steps,
@@ -427,7 +430,13 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, co
                 row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
             rows.append(row)
             made.append((_provenance_row(episode, index), levels))
-    pq.write_table(pa.Table.from_pylist(rows), path / EPISODES)
+    table = pa.Table.from_pylist(rows)
+    # An empty list has no type of its own, and lerobot reads all files as one table.
+    for name, dtype in SCHEMA.labels.items():
+        place = table.schema.get_field_index(name)
+        values = pa.array(table[name].to_pylist(), pa.list_(pa.type_for_alias(dtype)))
+        table = table.set_column(place, name, values)
+    pq.write_table(table, path / EPISODES)
     _write_summary(path, made, content)
 
 
@@ -479,6 +488,7 @@ def _episode_row(episode: Episode, piece: Piece, index: int, first_step: int, fr
         "meta/episodes/chunk_index": chunk,
         "meta/episodes/file_index": file,
     }
+    row |= labels_of(episode)
     before = first_step - piece.first_step
     for view in episode.frames if frames == "video" else ():
         key = ALL_VIEWS[view].lerobot_key
@@ -512,7 +522,8 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
             for name, all_figures in _episode_statistics(numbers, levels).items():
                 figures[convention.name(name)] = listed({figure: all_figures[figure] for figure in STATISTICS_V21})
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
-            episodes.write(json.dumps(row | {"episode_id": episode.episode_id}) + "\n")
+            row |= {"episode_id": episode.episode_id, **labels_of(episode)}
+            episodes.write(json.dumps(row) + "\n")
             stats.write(json.dumps({"episode_index": index, "stats": figures}) + "\n")
             made.append((_provenance_row(episode, index), levels))
     _write_summary(path, made, content)
