@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
+from pipeline.catalogue.scene_files import portable
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import provenance_of
 from pipeline.files import Edition, edition
@@ -15,7 +16,7 @@ from pipeline.planning.streams import streams_of
 from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Episode, Extra, Subtask
+from pipeline.types import Episode, Extra, Replay, Subtask
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,14 @@ class EpisodeLoader:
     Attributes:
         extras: ``outcome`` for failures.
         rewrites: episode id to other wordings of its task. Episodes get rewrites and subtasks only if it is set.
+        replays: True if episodes get the states and the scene of their replay.
     """
 
     data: Path
     render_config: RenderConfig
     extras: tuple[Extra, ...] = ()
     rewrites: Mapping[str, Sequence[str]] | None = None
+    replays: bool = False
 
     @cached_property
     def _frames(self) -> FrameStore:
@@ -60,11 +63,17 @@ class EpisodeLoader:
             geometry={view: rendered.geometry[name] for view, name in geometry.items()},
             object_poses=rendered.object_poses,
             instances=rendered.instances,
+            replay=self._replay(row) if self.replays else None,
         )
         if self.rewrites is None:
             return episode
         subtasks = _subtasks(self.data / TRAJECTORIES, row.trajectory_id, row.suite, row.task)
         return replace(episode, rewrites=self.rewrites[episode_id], subtasks=subtasks)
+
+    def _replay(self, row: plan.Row) -> Replay:
+        trajectory = TrajectoryStore(self.data / TRAJECTORIES).load(row.trajectory_id)
+        scene = replace(trajectory.scene, model_xml=portable(trajectory.model_xml))
+        return Replay(trajectory.actions, trajectory.states[:-1], scene, row.demo_origin_sha256)
 
 
 @lru_cache(maxsize=1)

@@ -138,7 +138,7 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
         steps = outcome.trajectories[row.trajectory_id]["steps"]
         episodes[episode_id] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
     extras: tuple[Extra, ...] = ("outcome",) if failures else ()
-    return Episodes(episodes, run.episodes(extras=extras, rewrites=rewrites))
+    return Episodes(episodes, run.episodes(extras=extras, rewrites=rewrites, replays=target.stores_replay))
 
 
 @cache

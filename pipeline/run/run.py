@@ -125,10 +125,14 @@ class Run:
         return [*self.formats, *recorded_failures]
 
     def episodes(
-        self, extras: tuple[Extra, ...] = (), rewrites: Mapping[str, Sequence[str]] | None = None
+        self,
+        extras: tuple[Extra, ...] = (),
+        rewrites: Mapping[str, Sequence[str]] | None = None,
+        *,
+        replays: bool = False,
     ) -> EpisodeLoader:
-        """Return the loader of rendered episodes; for ``extras`` and ``rewrites`` see ``EpisodeLoader``."""
-        return EpisodeLoader(self.folder, self.config.render, extras, rewrites)
+        """Return the loader of rendered episodes; for the arguments see ``EpisodeLoader``."""
+        return EpisodeLoader(self.folder, self.config.render, extras, rewrites, replays)
 
     def workers(self, *, renders: bool = False) -> AbstractContextManager[Workers]:
         """Start the workers of the section ``compute``, which stop when the context ends."""
