@@ -2,10 +2,12 @@
 
     nice -n 10 python benchmarks/repeat_in_libero.py data/starter [--limit 10]
     nice -n 10 python benchmarks/repeat_in_libero.py data/demos
+    nice -n 10 python benchmarks/repeat_in_libero.py data/starter/hdf5
 
-The folder belongs to a finished run, or ``demos expand`` wrote it; then its HDF5 files are read. The environment starts
-where the replay started, settles, and gets the stored actions through LIBERO's own ``step``. No code of
-``pipeline/physics/`` is used, and nothing is rendered. The name of each trajectory that differs is printed. The last
+The folder belongs to a finished run, or ``demos expand`` or the format ``hdf5`` wrote it; then its HDF5 files are read.
+The first of several episodes with equal actions, states and scene is repeated. The environment starts where the replay
+started, settles, and gets the stored actions through LIBERO's own ``step``. No code of ``pipeline/physics/`` is used,
+and nothing is rendered. The name of each trajectory that differs is printed. The last
 line is JSON: the number of trajectories by perturbed component, and the number of equal ones. 30 trajectories took 1.5
 minutes of CPU.
 """
@@ -16,19 +18,23 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.formats.hdf5.layout import START_STATE
+from pipeline.formats.hdf5.read import start_of
+from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Floats, Scene, Task
+from pipeline.types import Demo, Floats, Scene, Task
 
 STEP_S = 0.05
 """Duration of a control step; the times of the states give the number of settling steps."""
@@ -89,8 +95,17 @@ def _of_demonstrations(root: Path) -> Iterator[Done]:
         task = find_task(file.parent.name, file.name.removesuffix("_demo.hdf5"))
         for entry in source.index([task]).entries:
             demo = source.load(entry.demo_id)
-            scene = recorded_start(demo, str(demo.model_xml), settles=False)
+            scene = _exported_start(file, demo) or recorded_start(demo, str(demo.model_xml), settles=False)
             yield Done(task, entry.origin, entry.demo_id, scene, np.array(demo.states), demo.actions)
+
+
+def _exported_start(file: Path, demo: Demo) -> Scene | None:
+    """Return the start of an episode of the format ``hdf5``; ``None`` for a demonstration."""
+    with hdf5.opened(file) as content:
+        group = content["data"][demo.key]
+        if START_STATE not in group.attrs:
+            return None
+        return replace(start_of(group), model_xml=str(demo.model_xml))
 
 
 def opened(task: Task) -> Any:

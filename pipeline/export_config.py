@@ -74,6 +74,7 @@ class ExportConfig(_Formats):
         lerobot: Options of the LeRobot dataset; ``null`` leaves the format out.
         lerobot_v21: Options of additional datasets for clients that read LeRobot v2.1; left out by default.
         lerobot_openpi: Options of an additional dataset of this version in openpi's convention; left out by default.
+        hdf5: Options of additional HDF5 files in LIBERO's own layout; left out by default.
         where: Filter of the kept episodes; by default all of them are written.
         failures: True also writes replays that missed their goal, into separate datasets below ``failures/``; false by
             default.

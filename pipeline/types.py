@@ -309,6 +309,22 @@ class Rendered:
     subtasks: Sequence[Subtask] = ()
 
 
+class Replay(NamedTuple):
+    """States and scene behind an episode, in double precision.
+
+    Attributes:
+        actions: (T, 7) executed actions.
+        states: (T, S) flattened MuJoCo states before each action.
+        scene: its start, before the arm and the objects settled; MJCF with portable names of files.
+        origin_sha256: content hash of the human demonstration behind it.
+    """
+
+    actions: Floats
+    states: Floats
+    scene: Scene
+    origin_sha256: str
+
+
 @dataclass(frozen=True)
 class Episode:
     """Observations of a policy, ready for the writers; names, units and signs are those of ``schemas/episode.json``.
@@ -323,6 +339,7 @@ class Episode:
         object_poses, instances: as in ``Rendered``.
         rewrites: other wordings of its task, for training.
         subtasks: its subtasks in their order; empty if the trajectory manipulates nothing that the goal names.
+        replay: its states and its scene; ``None`` if not requested.
     """
 
     episode_id: str
@@ -338,6 +355,7 @@ class Episode:
     instances: Sequence[str] = ()
     rewrites: Sequence[str] = ()
     subtasks: Sequence[Subtask] = ()
+    replay: Replay | None = None
 
     def __len__(self) -> int:
         return len(self.action)

@@ -21,14 +21,17 @@ from pipeline import seeding
 from pipeline.episode_schema import SCHEMA, Content
 from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.hdf5 import Hdf5, Hdf5Config
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export
-from pipeline.types import Episode, Extra, Geometry, Jpeg, Subtask
+from pipeline.types import Episode, Extra, Geometry, Jpeg, Push, Replay, Scene, Subtask
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
 SET = f"{NAME}_spatial"
+TASK = "libero_spatial/pick_up_the_black_bowl_next_to_the_plate_and_place_it_on_the_plate"
+DEMO = f"{TASK}/demo_0"
 REPO = NAME
 
 REWRITES = ("kindly put the bowl on the plate", "the plate is where the bowl goes")
@@ -79,7 +82,18 @@ def episode(episode_id: str) -> Episode:
         geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
         rewrites=() if episode_id == WITHOUT_LABELS else REWRITES,
         subtasks=() if episode_id == WITHOUT_LABELS else SUBTASKS,
+        replay=replay_of(action),
     )
+
+
+def replay_of(action: NDArray[np.float32]) -> Replay:
+    """Return a replay of these actions; its actions have the digits of double precision."""
+    steps = len(action)
+    rng = seeding.rng("test_writers", "replay", steps)
+    scene = Scene("<mujoco/>", rng.normal(size=30), gripper=-1.0, posture_rad=(0.1,) * 7)
+    push = Push("robot0_link7", (1.0, 2.0, 3.0, 0.0, 0.0, 0.0), 2, 4)
+    actions = action.astype(np.float64)
+    return Replay(actions, rng.normal(size=(steps, 30)), replace(scene, push=push), "origin")
 
 
 def goals(state: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -130,7 +144,7 @@ def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -
     facts: dict[str, Known] = {}
     for episode_id in IDS:
         source = episode(episode_id)
-        facts[episode_id] = Known("libero_spatial", content, "", source.instruction, len(source))
+        facts[episode_id] = Known("libero_spatial", content, DEMO, source.instruction, len(source))
     return Episodes(facts, load)
 
 
@@ -171,6 +185,14 @@ def write_lerobot_v21(
     extras: Sequence[Extra] = (),
 ) -> LeRobotV21:
     target = LeRobotV21(out, LeRobotV21Config(name=NAME, convention=convention), Content(extras=tuple(extras)))
+    export(target, episodes(load), run)
+    return target
+
+
+def write_hdf5(
+    out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, extras: Sequence[Extra] = ()
+) -> Hdf5:
+    target = Hdf5(out, Hdf5Config(name=NAME), Content(extras=tuple(extras)))
     export(target, episodes(load), run)
     return target
 

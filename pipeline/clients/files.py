@@ -14,8 +14,11 @@ A command line with 25,000 episodes would be too long for Linux.
 
 STARVLA_CONFIG = "starvla_data_config.py"
 
+ROBOMIMIC_CONFIG = "robomimic.json"
+"""robomimic's configuration, with the observations of the HDF5 files."""
+
 OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
 """Path of the statistics below the configuration's assets folder; the configuration reads it to serve a policy."""
 
-FILES = (RECIPE, OFT_SCRIPT, LEROBOT_TRAIN, STARVLA_CONFIG, str(OPENPI_ASSETS))
+FILES = (RECIPE, OFT_SCRIPT, LEROBOT_TRAIN, STARVLA_CONFIG, ROBOMIMIC_CONFIG, str(OPENPI_ASSETS))
 """All names. Other files in the folder are foreign, and no stage and no command deletes them."""

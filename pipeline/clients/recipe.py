@@ -12,11 +12,12 @@ import pyarrow.parquet as pq
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from pipeline.clients.files import LEROBOT_TRAIN, OFT_SCRIPT, OPENPI_ASSETS, RECIPE, STARVLA_CONFIG
+from pipeline.clients.files import LEROBOT_TRAIN, OFT_SCRIPT, OPENPI_ASSETS, RECIPE, ROBOMIMIC_CONFIG, STARVLA_CONFIG
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
+from pipeline.formats.hdf5 import Hdf5
 from pipeline.formats.lerobot import LeRobot, LeRobotOpenpi, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.rlds_layout import dataset_of, split_of
@@ -36,6 +37,7 @@ EXPORTS = {
     "gr00t": "export: {lerobot_v21: {convention: ipec}}",
     "openpi": "export: {lerobot_openpi: {}}",
     "openpi_serve": "export: {lerobot_openpi: {}}",
+    "robomimic": "export: {hdf5: {}}",
 }
 """Client to the setting of a run's configuration that exports the format that it reads."""
 
@@ -97,6 +99,7 @@ def _training_and_clients(export: ExportConfig, oft_validates: bool, rewrite_pro
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
     values |= {"rewrite_probability": rewrite_probability}
+    values |= {"robomimic_config": ROBOMIMIC_CONFIG}
     values |= {"ipec_set": _v21_of(export, "ipec"), "openpi_set": _v21_of(export, "openpi")}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
     missing = {client: setting for client, setting in EXPORTS.items() if client not in sections["clients"]}
@@ -158,6 +161,8 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
             roots = sorted(path.name for path in datasets[format_name].iterdir() if not path.name.endswith("_val"))
             mixture = _filled("starvla_data_config.py.j2", name=name, roots=roots)
             (unfinished / STARVLA_CONFIG).write_text(mixture)
+        if export.options_for(Hdf5) is not None:
+            shutil.copyfile(TEMPLATES / ROBOMIMIC_CONFIG, unfinished / ROBOMIMIC_CONFIG)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -135,6 +135,16 @@ class Format(ABC, Generic[Options]):
     """Packages that compute the bytes of the files."""
     group: ClassVar[str]
     """Name of the format that is written by the same stage, ``export_<group>``; most often the format's own name."""
+    stores_replay: ClassVar[bool] = False
+    """True if the format stores the states and the scene of each episode's replay."""
+    turns_frames: ClassVar[bool] = True
+    """True if frames are rotated by 180 degrees from LIBERO's raw frames, as in an ``Episode``."""
+    maps_stored_as: ClassVar[str] = "PNG"
+    """Form of depth and segmentation, in words."""
+    flattens_matrices: ClassVar[bool] = False
+    """True if matrices are stored row by row, without their shape."""
+    held_out_place: ClassVar[str]
+    """End of the card's sentence on the episodes for validation, in Markdown."""
     splits_each_suite: ClassVar[bool] = False
     """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
     step_s: ClassVar[float]

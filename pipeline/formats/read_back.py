@@ -62,6 +62,7 @@ class Copy:
         said: lerobot's language column, the entries of each step; ``None`` where the dataset has no such column.
         train: True if the episode is in the training split.
         statistics: statistics of the episode; ``None`` where the dataset states none.
+        lossless: True if the frames in ``decoded`` were stored without loss.
     """
 
     dataset: str
@@ -73,6 +74,7 @@ class Copy:
     said: Sequence[Sequence[Mapping[str, Any]]] | None = None
     train: bool = True
     statistics: Statistics | None = None
+    lossless: bool = False
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -116,7 +118,7 @@ def subtasks_of(starts: Sequence[int], texts: Sequence[str]) -> tuple[Subtask, .
     Raises:
         ValueError: when they differ in length.
     """
-    return tuple(Subtask(start, text) for start, text in zip(starts, texts, strict=True))
+    return tuple(Subtask(int(start), str(text)) for start, text in zip(starts, texts, strict=True))
 
 
 def in_both_splits(

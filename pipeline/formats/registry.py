@@ -6,6 +6,7 @@ from typing import Any
 import pyarrow as pa
 
 from pipeline.formats.base import Format
+from pipeline.formats.hdf5 import Hdf5
 from pipeline.formats.lerobot import LeRobot, LeRobotOpenpi, LeRobotV21
 from pipeline.formats.rlds import Rlds
 
@@ -14,6 +15,7 @@ FORMATS: tuple[type[Format[Any]], ...] = (
     LeRobot,
     LeRobotV21,
     LeRobotOpenpi,
+    Hdf5,
 )
 
 

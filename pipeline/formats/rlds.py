@@ -53,6 +53,7 @@ class Rlds(Format[RldsConfig]):
     recipe: ClassVar = 8
     packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
     splits_each_suite: ClassVar = True  # OpenVLA-OFT, when it validates, reads the split val of each set.
+    held_out_place: ClassVar = "are the split `val` of each set."
     group: ClassVar = "rlds"
     step_s: ClassVar = 0.0004
     columns: ClassVar = (

@@ -50,6 +50,16 @@ They hold the id and the content hash of its direct source, and the content hash
 origin.
 """
 
+FRAME_PX = 128
+"""Height and width of the frames in LIBERO's files."""
+
+IMAGES_NDIM = 4
+"""Number of dimensions of an array of images (T, H, W, C)."""
+
+COMPRESSION: Mapping[str, Any] = {"compression": "gzip", "compression_opts": 1}
+"""Lossless compression of images. HDF5 itself reads gzip. Higher levels save 10 % at most and take up to 2.7 times as
+long (``benchmarks/hdf5_compression.py``)."""
+
 # LIBERO's longest demonstrations have about 500 steps. Without a limit, a few bytes of header could request all memory.
 _MAX_NUMBERS = 10_000_000
 _Node = TypeVar("_Node", h5py.Group, h5py.Dataset)
@@ -167,6 +177,8 @@ class Recording:
         model_file: MJCF of the scene.
         obs: name to (T, ...), such as ``agentview_rgb`` (T, 128, 128, 3) or ``ee_pos`` (T, 3).
         attrs: further attributes.
+        further: name to further arrays (T, ...) of the steps.
+        success: True if the last step reaches the goal and is rewarded.
     """
 
     actions: Floats
@@ -174,14 +186,29 @@ class Recording:
     robot_states: Floats
     model_file: str
     obs: Mapping[str, NDArray[Any]]
-    attrs: Mapping[str, str] = field(default_factory=dict)
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+    further: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    success: bool = True
 
 
-def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
-    """Write a task's demonstrations in the form that LIBERO publishes, for programs that read LIBERO's files.
+def proprioception(hands: Floats, joints: Floats) -> dict[str, Floats]:
+    """Return LIBERO's observations without images, by name.
 
-    Equal recordings give equal bytes.
+    Args:
+        hands: (T, 8) end-effector position in m, axis-angle in rad, two finger positions in m.
+        joints: (T, 7) joint angles of the arm in rad.
     """
+    return {
+        "ee_pos": hands[:, :3],
+        "ee_ori": hands[:, 3:6],
+        "ee_states": hands[:, :6],
+        "gripper_states": hands[:, 6:],
+        "joint_states": joints,
+    }
+
+
+def task_attributes(task: Task, frame_px: int = FRAME_PX) -> dict[str, str]:
+    """Return the attributes of the group ``data`` that depend only on the task and the size of the frames."""
     bddl = task.bddl_file.read_text()
     (problem,) = re.findall(r"\(problem\s+([^()]+)\)", bddl)
     (language,) = re.findall(r"\(:language\s+([^()]+)\)", bddl)
@@ -199,8 +226,8 @@ def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
         "camera_names": ["robot0_eye_in_hand", "agentview"],
         "reward_shaping": True,
         "control_freq": 20,
-        "camera_heights": 128,
-        "camera_widths": 128,
+        "camera_heights": frame_px,
+        "camera_widths": frame_px,
         "camera_segmentations": None,
     }
     env_args = {
@@ -215,26 +242,38 @@ def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
         "domain_name": "robosuite",
         "language_instruction": language.strip().lower(),
     }
+    return {
+        "env_name": str(env_args["env_name"]),
+        "env_args": json.dumps(env_args),
+        "problem_info": json.dumps(problem_info),
+        "bddl_file_name": bddl_file,
+        "bddl_file_content": bddl,
+        "macros_image_convention": "opengl",
+        "tag": "libero-v1",
+    }
+
+
+def write(path: Path, task: Task, recordings: Iterable[Recording], frame_px: int = FRAME_PX) -> None:
+    """Write a task's demonstrations in the form that LIBERO publishes, for programs that read LIBERO's files.
+
+    Equal recordings give equal bytes. Memory holds one recording at a time.
+
+    Args:
+        frame_px: height and width of the frames, which the file states.
+    """
     with replaced(path) as temporary, h5py.File(temporary, "w") as file:
         data, total, count = file.create_group("data"), 0, 0
         for count, recording in enumerate(recordings, start=1):
             _write_demo(data.create_group(f"demo_{count - 1}"), recording)
             total += len(recording.actions)
-        data.attrs.update(
-            env_name=env_args["env_name"],
-            env_args=json.dumps(env_args),
-            problem_info=json.dumps(problem_info),
-            bddl_file_name=bddl_file,
-            bddl_file_content=bddl,
-            macros_image_convention="opengl",
-            tag="libero-v1",
-            num_demos=count,
-            total=total,
-        )
+        data.attrs.update(task_attributes(task, frame_px), num_demos=count, total=total)
 
 
 def _write_demo(group: h5py.Group, recording: Recording) -> None:
-    """Write one demonstration into its group; reward and end are 1 at the last step."""
+    """Write one demonstration into its group; the end, and the reward of a success, are 1 at the last step.
+
+    Images are compressed, each by itself, so that a reader of one step decompresses one image.
+    """
     steps = len(recording.actions)
     at_end = np.zeros(steps, np.uint8)
     at_end[-1] = 1
@@ -242,12 +281,16 @@ def _write_demo(group: h5py.Group, recording: Recording) -> None:
         "actions": recording.actions,
         "states": recording.states,
         "robot_states": recording.robot_states,
-        "rewards": at_end,
+        "rewards": at_end if recording.success else np.zeros_like(at_end),
         "dones": at_end,
+        **recording.further,
         **{f"obs/{name}": values for name, values in recording.obs.items()},
     }
     for name, values in content.items():
-        group.create_dataset(name, data=values)
+        if values.ndim == IMAGES_NDIM:
+            group.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), **COMPRESSION)
+        else:
+            group.create_dataset(name, data=values)
     group.attrs.update(num_samples=steps, model_file=recording.model_file, init_state=recording.states[0])
     group.attrs.update(recording.attrs)
 

@@ -1,10 +1,11 @@
 """Loader that joins the plan and the rendered streams to an ``Episode``, which a writer puts into a dataset."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
+from pipeline.catalogue.scene_files import portable
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import Content
 from pipeline.files import Edition, edition
@@ -14,7 +15,7 @@ from pipeline.planning.streams import streams_of
 from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Episode
+from pipeline.types import Episode, Replay
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,14 @@ class EpisodeLoader:
     Attributes:
         failures: True for failures, which have further columns.
         rewrites: episode id to other wordings of its task; without them, the episode has none.
+        replays: True if episodes get the states and the scene of their replay.
     """
 
     data: Path
     render_config: RenderConfig
     failures: bool = False
     rewrites: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    replays: bool = False
 
     @cached_property
     def content(self) -> Content:
@@ -67,7 +70,13 @@ class EpisodeLoader:
             instances=rendered.instances,
             rewrites=self.rewrites.get(episode_id, ()),
             subtasks=rendered.subtasks,
+            replay=self._replay(row) if self.replays else None,
         )
+
+    def _replay(self, row: plan.Row) -> Replay:
+        trajectory = TrajectoryStore(self.data / TRAJECTORIES).load(row.trajectory_id)
+        scene = replace(trajectory.scene, model_xml=portable(trajectory.model_xml))
+        return Replay(trajectory.actions, trajectory.states[:-1], scene, row.demo_origin_sha256)
 
 
 @lru_cache(maxsize=1)

@@ -236,13 +236,7 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
         states=trajectory.states[:-1],
         robot_states=np.array(robot, np.float64),
         model_file=portable(trajectory.model_xml),
-        obs={
-            "ee_pos": hand_states[:, :3],
-            "ee_ori": hand_states[:, 3:6],
-            "ee_states": hand_states[:, :6],
-            "gripper_states": hand_states[:, 6:],
-            "joint_states": np.array(joints, np.float64),
-        },
+        obs=hdf5.proprioception(hand_states, np.array(joints, np.float64)),
         attrs={
             hdf5.EXPANDED_FROM: row.demo_id,
             hdf5.EXPANDED_FROM_SHA256: row.demo_sha256,

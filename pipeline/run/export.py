@@ -135,7 +135,8 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
         content = digest(content, rewrites[episode_id])[:16]
         steps = outcome.trajectories[row.trajectory_id]["steps"]
         episodes[episode_id] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
-    return Episodes(episodes, run.episodes(failures=failures, rewrites=rewrites))
+    load = run.episodes(failures=failures, rewrites=rewrites, replays=target.stores_replay)
+    return Episodes(episodes, load)
 
 
 @cache

@@ -123,9 +123,15 @@ class Run:
         recorded_failures = [dataset for dataset in self.failure_formats if dataset.record_file.exists()]
         return [*self.formats, *recorded_failures]
 
-    def episodes(self, *, failures: bool = False, rewrites: Mapping[str, Sequence[str]] | None = None) -> EpisodeLoader:
-        """Return the loader of rendered episodes; for ``failures`` and ``rewrites`` see ``EpisodeLoader``."""
-        return EpisodeLoader(self.folder, self.config.render, failures, rewrites or {})
+    def episodes(
+        self,
+        *,
+        failures: bool = False,
+        rewrites: Mapping[str, Sequence[str]] | None = None,
+        replays: bool = False,
+    ) -> EpisodeLoader:
+        """Return the loader of rendered episodes; for the arguments see ``EpisodeLoader``."""
+        return EpisodeLoader(self.folder, self.config.render, failures, rewrites or {}, replays)
 
     def workers(self, *, renders: bool = False) -> AbstractContextManager[Workers]:
         """Start the workers of the section ``compute``, which stop when the context ends."""

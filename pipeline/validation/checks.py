@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
+from pipeline.catalogue.scene_files import portable
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, label_faults, labels_of
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_numbers, wrong_pixels, wrong_sample
@@ -96,6 +97,26 @@ def motion(case: Case) -> Iterator[Fault]:
                 step = next(t for t in range(len(made)) if not _same(values[t], made[t]))
                 what = f"{name} of step {step} is {values[step].tolist()}"
                 yield case.finding(copy.dataset, what, made[step].tolist())
+        yield from _replay(case, copy)
+
+
+def _replay(case: Case, copy: Copy) -> Iterator[Fault]:
+    """Compare the states and the scene that a dataset stores with the replay's, bit for bit."""
+    stored, trajectory = copy.episode.replay, case.trajectory
+    if stored is None:
+        return
+    if not _same(stored.actions, trajectory.actions):
+        yield case.finding(copy.dataset, "has other actions in double precision", "the actions of the replay")
+    if not _same(stored.states, trajectory.states[:-1]):
+        yield case.finding(copy.dataset, "has other states", "the states of the replay before each action")
+    scene, expected = stored.scene, trajectory.scene
+    if scene.model_xml != portable(expected.model_xml):
+        yield case.finding(copy.dataset, "has another scene in model_file", "the scene of the replay")
+    start = (scene.gripper, scene.posture_rad, scene.push)
+    if not _same(scene.state, expected.state) or start != (expected.gripper, expected.posture_rad, expected.push):
+        yield case.finding(copy.dataset, "has another start", "the start of the replay")
+    if stored.origin_sha256 != case.row["demo_origin_sha256"]:
+        yield case.finding(copy.dataset, f"origin_sha256 is {stored.origin_sha256}", case.row["demo_origin_sha256"])
 
 
 def _goals(case: Case) -> Iterator[Fault]:
@@ -196,7 +217,7 @@ def place(case: Case) -> Iterator[Fault]:
 
 
 def jpeg(case: Case) -> Iterator[Fault]:
-    """Check that the image files of a dataset have the bytes of the stored frames."""
+    """Check that the image files of a dataset have the bytes of the stored frames, and lossless frames their pixels."""
     for copy in case.copies:
         for view, files in copy.episode.frames.items():
             pairs = zip(files, case.made.frames[view], strict=False)
@@ -204,6 +225,12 @@ def jpeg(case: Case) -> Iterator[Fault]:
             if wrong:
                 what = f"{view} differs at {len(wrong)} steps, first at {wrong[0]}"
                 yield case.finding(copy.dataset, what, "the stored JPEG")
+        for (view, step), frame in copy.decoded.items() if copy.lossless else ():
+            stored = case.stored[view].frames.get(step)
+            if stored is not None and not np.array_equal(frame, stored):
+                yield case.finding(
+                    copy.dataset, f"{view} of step {step} has other pixels", "the pixels of the stored JPEG"
+                )
 
 
 def geometry(case: Case) -> Iterator[Fault]:

@@ -2,14 +2,16 @@
 
 import json
 import runpy
+import shlex
 from pathlib import Path
 
+import h5py
 import jsonschema
 import numpy as np
 import pytest
 import yaml
 from conftest import datasets_in
-from synthetic import IDS, SET, episode, write_lerobot_v21
+from synthetic import IDS, SET, TASK, episode, write_hdf5, write_lerobot_v21
 from tiny_recipe import NAME, ROWS, SUITES, export_config, row, tiny_recipe
 
 from pipeline.clients.recipe import build, write
@@ -74,11 +76,29 @@ def test_a_run_of_both_conventions_has_all_clients(tmp_path: Path) -> None:
         lerobot_v21={"name": NAME, "convention": "ipec"}, lerobot_openpi={"name": NAME, "validation": 0.1}
     )
     recipe = tiny_recipe(tmp_path, export)
-    assert "clients_of_other_formats" not in recipe
+    assert recipe["clients_of_other_formats"].keys() == {"robomimic"}
     assert "$DATA/lerobot_openpi " in recipe["clients"]["openpi"]["command"]
     assert "$DATA/lerobot_v21 " in recipe["clients"]["starvla"]["command"]
     named = [client for dataset in export.datasets(tmp_path) for client in dataset.clients]
     assert sorted(named) == sorted(recipe["clients"])
+
+
+def test_robomimic_reads_what_every_demonstration_has(tmp_path: Path) -> None:
+    export = export_config(hdf5={"name": NAME})
+    recipe = tiny_recipe(tmp_path, export)
+    target = write_hdf5(tmp_path)
+    datasets = {"hdf5": target.folder, "lerobot": tmp_path}
+    write(recipe, tmp_path / "finetune", export, datasets)
+    command = recipe["clients"]["robomimic"]["command"].replace("$DATA", str(tmp_path)).replace("SUITE/TASK", TASK)
+    words = shlex.split(command)
+    options = dict(zip(words[3::2], words[4::2], strict=True))
+    config = json.loads(Path(options["--config"]).read_text())
+    modalities = config["observation"]["modalities"]["obs"]
+    with h5py.File(options["--dataset"]) as file:
+        for demo in file["data"].values():
+            assert {*modalities["rgb"], *modalities["low_dim"]} <= demo["obs"].keys()
+            assert "next_obs" not in demo
+    assert not config["train"]["hdf5_load_next_obs"]
 
 
 def test_openvla_oft_has_the_same_batch_on_any_number_of_gpus(tmp_path: Path) -> None:

@@ -24,6 +24,9 @@ EPISODES_OF_A_PIECE = 50
 """Largest number of episodes that are written again after a call was killed; the files do not depend on it."""
 
 
+MAPS_STORED_AS = "PNG as base64 text"
+
+
 class LeRobotConfig(FormatOptions):
     """Options of the LeRobot dataset.
 
@@ -80,6 +83,12 @@ class LeRobot(Format[LeRobotConfig]):
     by_default: ClassVar = True
     recipe: ClassVar = 10
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
+    held_out_place: ClassVar = (
+        "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless it is restricted "
+        "as below."
+    )
+    maps_stored_as: ClassVar = MAPS_STORED_AS
+    flattens_matrices: ClassVar = True
     group: ClassVar = "lerobot"
     step_s: ClassVar = 0.0015
     columns: ClassVar = (
@@ -243,6 +252,9 @@ class LeRobotV21(Format[LeRobotV21Config]):
     options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
     recipe: ClassVar = 5
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
+    held_out_place: ClassVar = "are separate sets, whose names end in `_val`."
+    maps_stored_as: ClassVar = MAPS_STORED_AS
+    flattens_matrices: ClassVar = True
     group: ClassVar = LeRobot.group
     step_s: ClassVar = LeRobot.step_s
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
