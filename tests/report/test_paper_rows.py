@@ -333,6 +333,16 @@ def test_results_of_another_benchmark_and_damaged_files_are_rejected(tmp_path: P
         read_tested([file])
 
 
+def test_files_of_two_policies_in_one_folder_are_rejected(tmp_path: Path) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config = {"benchmark": THEIR_CLASS, "params": {"suite": "libero_goal"}}
+    file = write_vla_eval(tmp_path, config, [(their_task(test, "prompt"), {"success": True})])
+    (tmp_path / "pi0_aggregate.json").write_bytes(file.read_bytes())
+    with pytest.raises(PipelineError, match="two files have the task") as caught:
+        read_tested([tmp_path])
+    assert "name_aggregate.json and" in str(caught.value.where)
+
+
 # Results of lerobot-eval, written by lerobot's own evaluation.
 
 
