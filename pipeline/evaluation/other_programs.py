@@ -144,8 +144,7 @@ def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
     for path in paths:
         vla_eval, lerobot = _files(path)
         if vla_eval:
-            episodes = [episode for file in vla_eval for episode in _vla_eval_episodes(file)]
-            policies.append(_policy(vla_eval[0].parent, "vla-eval", episodes))
+            policies.append(_policy(vla_eval[0].parent, "vla-eval", _vla_eval_files(vla_eval)))
         elif lerobot is not None:
             policies.append(_policy(lerobot.parent, "lerobot-eval", _lerobot_episodes(lerobot)))
         else:
@@ -206,6 +205,29 @@ def _policy(folder: Path, program: str, episodes: Sequence[_Episode]) -> TestedP
         limits_of(limits),
         len(episodes) - len(ended),
     )
+
+
+def _vla_eval_files(files: Sequence[Path]) -> list[_Episode]:
+    """Read the episodes of one policy from vla-eval's files of several benchmarks.
+
+    Raises:
+        PipelineError: if a file is rejected, or if a task is in two files, which may be of two policies.
+    """
+    episodes: list[_Episode] = []
+    file_of: dict[tuple[str, str], Path] = {}
+    for file in files:
+        of_file = _vla_eval_episodes(file)
+        for episode in of_file:
+            earlier = file_of.setdefault((episode.test.suite, episode.test.name), file)
+            if earlier != file:
+                raise PipelineError(
+                    f"two files have the task {episode.test.suite}/{episode.test.name}",
+                    where=f"{earlier} and {file}",
+                    expected="the files of one policy in a folder, each task in one of them",
+                    remedy="move the files of each policy into a folder of its own",
+                )
+        episodes += of_file
+    return episodes
 
 
 def _vla_eval_episodes(file: Path) -> list[_Episode]:

@@ -6,6 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -274,7 +275,7 @@ def test_results_of_vla_evals_own_benchmark_are_read(tmp_path: Path) -> None:
     camera, robot = first_of("libero_goal", "camera", 2), first_of("libero_goal", "robot")
     prompt = camera[0].name.replace("_", " ")
     assert prompt.endswith("initstate 0")
-    episodes = [
+    episodes: list[tuple[dict[str, Any], dict[str, Any]]] = [
         (their_task(camera[0], prompt), {"success": True}),
         (their_task(camera[1], camera[1].name.replace("_", " ")), {"success": False}),
         (their_task(robot[0], robot[0].name.replace("_", " ")), {"failure_reason": "server_unreachable"}),
@@ -333,6 +334,16 @@ def test_results_of_another_benchmark_and_damaged_files_are_rejected(tmp_path: P
         read_tested([file])
 
 
+def test_files_of_two_policies_in_one_folder_are_rejected(tmp_path: Path) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config = {"benchmark": THEIR_CLASS, "params": {"suite": "libero_goal"}}
+    file = write_vla_eval(tmp_path, config, [(their_task(test, "prompt"), {"success": True})])
+    (tmp_path / "pi0_aggregate.json").write_bytes(file.read_bytes())
+    with pytest.raises(PipelineError, match="two files have the task") as caught:
+        read_tested([tmp_path])
+    assert "name_aggregate.json and" in str(caught.value.where)
+
+
 # Results of lerobot-eval, written by lerobot's own evaluation.
 
 
@@ -370,7 +381,7 @@ def write_lerobot_eval(folder: Path, successes: dict[tuple[str, int], bool]) -> 
     envs: dict[str, dict[int, Any]] = defaultdict(dict)
     for (suite, number), success in successes.items():
         envs[suite][number] = gym.vector.SyncVectorEnv(
-            [lambda success=success: Decided(success)], autoreset_mode=gym.vector.AutoresetMode.SAME_STEP
+            [partial(Decided, success)], autoreset_mode=gym.vector.AutoresetMode.SAME_STEP
         )
     same: Any = PolicyProcessorPipeline(steps=[])
     with torch.no_grad():
