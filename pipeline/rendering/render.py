@@ -36,7 +36,7 @@ def render(
     the first frame of its scene is rejected (``FirstFrame``). Streams that differ only in colours share their geometry.
     """
     renderer = opened.renderer(trajectory.model_xml)
-    instances = Instances(renderer.model, trajectory, task) if named(render_config.extras) else None
+    instances = Instances(renderer.model, task, trajectory.scene.resolved) if named(render_config.extras) else None
     steps = range(len(trajectory.actions))
     renderer.restore(first_posture(trajectory.scene, renderer.model), trajectory.site_alpha[0])
     first_grip = grip_pose(renderer.data)
