@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -115,15 +116,18 @@ def compare_frame(picture: Path, task: str, init_state: int, view: str, sheet: P
     start and task. A difference is reported if its undoing fits, and no other view or orientation comes close. The exit
     status is 1 if the frames differ.
     """
-    from pipeline.evaluation.frame_report import compare_frame as compare
-    from pipeline.evaluation.frame_report import write_sheet
+    from contextlib import closing
+
+    from pipeline.evaluation import frame_report
+    from pipeline.evaluation.start_frames import LastStartFrames
     from pipeline.libero.tasks import find_task, select_tasks
 
     suite, _, name = task.partition("/")
     found = find_task(suite, name) if name else select_tasks([task])[0]
-    report = compare(picture, found, init_state, view, note=lambda text: print(text, file=sys.stderr))
+    with closing(LastStartFrames()) as opened:
+        report = frame_report.compare_frame(picture, found, init_state, view, opened, partial(print, file=sys.stderr))
     if sheet is not None:
-        write_sheet(report, sheet)
+        frame_report.write_sheet(report, sheet)
     print(json.dumps(report.as_json()) if as_json else "\n".join(report.lines()))
     return int(not report.equal)
 

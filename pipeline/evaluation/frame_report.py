@@ -1,17 +1,17 @@
 """Report of the differences between a user's first observation and ours, each with its remedy."""
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.frame_search import CLEAR, Found, Match, middle, search, search_tasks
+from pipeline.evaluation.frame_search import CLEAR, FEWEST_PX, Found, Match, middle, search
 from pipeline.evaluation.picture_fit import (
     FITTING,
     SIZE_PX,
@@ -27,7 +27,7 @@ from pipeline.evaluation.picture_fit import (
 )
 from pipeline.evaluation.picture_points import place
 from pipeline.evaluation.simulator import SETTLING_STEPS
-from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, Start, StartFrames, first_start
+from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
 from pipeline.files import replaced
 from pipeline.images.jpeg import encode_exactly, resized
 from pipeline.rendering.srgb import FIRST_VERSION
@@ -45,8 +45,8 @@ BRIGHTNESS = 0.04
 DECODED_PX = 40
 """Smallest number of pixels that show the textures of another MuJoCo."""
 
-DECODED_LEVELS = 8
-"""Smallest difference of such a pixel between the two versions."""
+DECODED_LEVELS = 4
+"""Smallest difference of such a pixel between the two versions, after smoothing."""
 
 SAME_RESIZING = 1.5
 """Largest mean difference from our frame, resized by the same method."""
@@ -56,9 +56,6 @@ RAMEKIN = "pick_up_the_black_bowl_on_the_ramekin_and_place_it_on_the_plate"
 
 BACKGROUND = ("nothing", "floor", "wall", "room", "table")
 """Instances that do not move."""
-
-FEWEST_PX = 30
-"""Smallest number of pixels of a thing that is compared."""
 
 PIN = "install mujoco==3.2.7 (docs/evaluation.md has the command for each evaluation code)"
 SETTLE = f"take {SETTLING_STEPS} steps with the action [0, 0, 0, 0, 0, 0, -1] before the first observation"
@@ -119,8 +116,7 @@ class Report:
             text.append("equal: view, orientation, size, colours and start are those of our frame")
         elif match.fit.fits:
             text.append(f"with all of this undone, the mean difference is {match.fit.error:.1f}")
-        own, decoded = self.found.versions
-        if match.fit.fits and (np.abs(own.astype(np.int16) - decoded).max(axis=2) > DECODED_LEVELS).sum() < DECODED_PX:
+        if match.fit.fits and _decoded_pixels(self.found).sum() < DECODED_PX:
             text.append("this picture cannot tell MuJoCo 3.2.7 from later versions; a picture of libero_object can")
         return text
 
@@ -144,7 +140,9 @@ class Report:
         }
 
 
-def compare_frame(file: Path, task: Task, number: int, view: str, note: Callable[[str], None]) -> Report:
+def compare_frame(
+    file: Path, task: Task, number: int, view: str, opened: LastStartFrames, note: Callable[[str], None]
+) -> Report:
     """Compare a picture of the first observation with our frame of an initial state of LIBERO.
 
     Args:
@@ -156,10 +154,8 @@ def compare_frame(file: Path, task: Task, number: int, view: str, note: Callable
         PipelineError: if the file is no picture that can be compared, or if there is no such initial state.
     """
     picture, start = read_picture(file), first_start(task, number)
-    found = search(picture, task, start, view, note)
-    if not found.match.fit.fits and found.clear:
-        found = search_tasks(found, note)
-    findings = (*_picture_findings(picture, found), *_scene_findings(found, start, view))
+    found = search(picture, task, start, view, opened, note)
+    findings = (*_picture_findings(picture, found), *_scene_findings(found, start, view, opened))
     return Report(_raw_difference(picture, found.expected), findings, found)
 
 
@@ -259,7 +255,7 @@ def _resizing(picture: Frame, match: Match) -> str:
     return ", resized or rendered in this size"
 
 
-def _scene_findings(found: Found, start: Start, view: str) -> Iterator[Finding]:
+def _scene_findings(found: Found, start: Start, view: str, opened: LastStartFrames) -> Iterator[Finding]:
     """Yield the differences of the scene: camera, MuJoCo, light, start, task."""
     match = found.match
     trusted = found.clear or match.fit.fits
@@ -273,7 +269,7 @@ def _scene_findings(found: Found, start: Start, view: str) -> Iterator[Finding]:
             f"give the policy {CAMERA_OF_VIEW[view]}_image",
         )
     if not match.fit.fits:
-        yield from _unmatched(found)
+        yield from _unmatched(found, opened)
         return
     yield from _version(found)
     if abs(match.fit.brightness - 1) > BRIGHTNESS:
@@ -289,7 +285,7 @@ def _version(found: Found) -> Iterator[Finding]:
     """Report the MuJoCo whose textures the picture shows, from the pixels that differ between versions."""
     match = found.match
     own, decoded = (_smooth_as(match, frame) for frame in found.versions)
-    shown = np.abs(own - decoded).max(axis=2) > DECODED_LEVELS
+    shown = _decoded_pixels(found)
     if shown.sum() < DECODED_PX:
         return
     picture = match.variant.smooth / match.fit.brightness
@@ -303,6 +299,12 @@ def _version(found: Found) -> Iterator[Finding]:
             "MuJoCo 3.2.7",
             PIN,
         )
+
+
+def _decoded_pixels(found: Found) -> NDArray[np.bool_]:
+    """Return a mask (S, S) of the pixels that show the textures' version."""
+    own, decoded = (_smooth_as(found.match, frame) for frame in found.versions)
+    return np.asarray(np.abs(own - decoded).max(axis=2) > DECODED_LEVELS)
 
 
 def _smooth_as(match: Match, frame: Frame) -> Smooth:
@@ -338,12 +340,12 @@ def _start_findings(found: Found, start: Start) -> Iterator[Finding]:
         yield Finding("task", f"the picture shows the task {match.task.name} ({before})", f"open {found.task.name}")
 
 
-def _unmatched(found: Found) -> Iterator[Finding]:
+def _unmatched(found: Found, opened: LastStartFrames) -> Iterator[Finding]:
     """Report a picture that no start of the scene fits: a moved camera, moved things, other colours, or nothing."""
     match = found.match
     left = f"the best match leaves {match.fit.error:.1f} grey levels, {match.fit.worst:.0f} in a patch of 16 pixels"
     placed = place(match.variant.pixels, match.frame)
-    if placed is None or (not found.clear and not placed.still):
+    if placed is None or not (found.clear or placed.still or placed.moved):
         yield Finding("unknown", f"nothing explains the picture; {left}", "check the task and the camera")
         return
     if not placed.still:
@@ -356,7 +358,7 @@ def _unmatched(found: Found) -> Iterator[Finding]:
             "keep LIBERO's camera agentview and its field of view",
         )
         return
-    apart = _things_apart(match)
+    apart = _things_apart(match, opened)
     if match.task.name == RAMEKIN and apart and not {"robot", "gripper"} & apart.keys():
         yield Finding(
             "mujoco",
@@ -384,11 +386,10 @@ def _listed(apart: dict[str, float]) -> str:
     return ", ".join(f"{name} ({level:.0f} grey levels)" for name, level in apart.items())
 
 
-def _things_apart(match: Match) -> dict[str, float]:
+def _things_apart(match: Match, opened: LastStartFrames) -> dict[str, float]:
     """Return the robot and the movable things that differ, with the mean difference of their pixels, largest first."""
     side = len(match.fit.residual)
-    with closing(StartFrames(match.task)) as frames:
-        things = frames.things(match.start, match.camera)
+    things = opened.of(match.task).things(match.start, match.camera)
     apart: dict[str, float] = {}
     for name, pixels in things.items():
         seen = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0

@@ -5,7 +5,6 @@ group are tried before one of them is reported.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,8 +12,10 @@ import numpy as np
 
 from pipeline.errors import RefusedError
 from pipeline.evaluation.picture_fit import Fit, Smooth, Variant, fit, smoothed, variants
+from pipeline.evaluation.picture_points import place
 from pipeline.evaluation.simulator import SETTLING_STEPS
-from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, Start, StartFrames
+from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, StartFrames
+from pipeline.libero import bddl
 from pipeline.libero import tasks as libero_tasks
 from pipeline.types import Frame, Task
 
@@ -32,6 +33,12 @@ ZOOMS = np.geomspace(0.6, 1.7, 53)
 
 CLEAR = 0.8
 """Largest error of a match, in multiples of the next one's, from which it counts as the better one."""
+
+IN_PLACE = 3.0
+"""Largest mean difference of an object's pixels if the object is in its place."""
+
+FEWEST_PX = 30
+"""Smallest number of pixels of a thing that is compared."""
 
 FEW_TASKS = 10
 """Largest number of a suite's tasks that are all searched; of larger suites, one task of each scene is searched."""
@@ -78,7 +85,9 @@ class Found:
     clear: bool
 
 
-def search(picture: Frame, task: Task, start: Start, view: str, note: Callable[[str], None]) -> Found:
+def search(
+    picture: Frame, task: Task, start: Start, view: str, opened: LastStartFrames, note: Callable[[str], None]
+) -> Found:
     """Search for the match of a picture.
 
     Args:
@@ -89,21 +98,32 @@ def search(picture: Frame, task: Task, start: Start, view: str, note: Callable[[
     Raises:
         PipelineError: if the task cannot be rebuilt on this machine.
     """
-    with closing(StartFrames(task)) as frames:
-        candidates = list(_appearances(picture, frames, start, list(CAMERA_OF_VIEW.values())))
-        expected = next(match.frame for match in candidates if match.camera == CAMERA_OF_VIEW[view] and not match.srgb)
+    frames = opened.of(task)
+    candidates = list(_appearances(picture, frames, start, list(CAMERA_OF_VIEW.values())))
+    expected = next(match.frame for match in candidates if match.camera == CAMERA_OF_VIEW[view] and not match.srgb)
+    match, clear = _clear_best(candidates)
+    if not clear:
+        note("none of the two views fits: searching other cameras")
+        rest = [camera for camera in frames.cameras if camera not in CAMERA_OF_VIEW.values()]
+        candidates += _appearances(picture, frames, start, rest)
         match, clear = _clear_best(candidates)
-        if not clear:
-            note("none of the two views fits: searching other cameras")
-            rest = [camera for camera in frames.cameras if camera not in CAMERA_OF_VIEW.values()]
-            candidates += _appearances(picture, frames, start, rest)
-            match, clear = _clear_best(candidates)
-        if not match.fit.fits:
-            match = _best([match, *_fitting(_zooms(match))])
-        others: tuple[Match, ...] = ()
-        if clear and not match.fit.fits:
-            match, others = _search_starts(match, frames, note)
+    if not match.fit.fits:
+        match = _best([match, *_fitting(_zooms(match))])
+    others: tuple[Match, ...] = ()
+    placed = place(match.variant.pixels, match.frame)
+    moved = placed is not None and placed.moved
+    right_state = clear and not match.fit.fits and not moved and _objects_in_place(match, frames)
+    if clear and not match.fit.fits and not moved:
+        match, others = _search_starts(match, frames, right_state, note)
+    if match.fit.fits or moved or right_state:
         return Found(task, match, others, expected, _versions(frames, match), clear)
+    for task_of_suite in _others(task):
+        note(f"searching {task_of_suite}")
+        frames = opened.of(task_of_suite)
+        other, distinct = _clear_best(list(_appearances(picture, frames, start, list(CAMERA_OF_VIEW.values()))))
+        if other.fit.fits:
+            return Found(task, other, (), expected, _versions(frames, other), distinct)
+    return Found(task, match, others, expected, _versions(opened.of(task), match), clear)
 
 
 def _clear_best(candidates: list[Match]) -> tuple[Match, bool]:
@@ -113,10 +133,28 @@ def _clear_best(candidates: list[Match]) -> tuple[Match, bool]:
     return match, match.fit.error <= CLEAR * another
 
 
-def _search_starts(match: Match, frames: StartFrames, note: Callable[[str], None]) -> tuple[Match, tuple[Match, ...]]:
-    """Search other starts of the task; return the best match, and the others of its group that fit."""
+def _objects_in_place(match: Match, frames: StartFrames) -> bool:
+    """Return whether half of the movable objects are where they are in our frame: then the initial state is right."""
+    objects = bddl.read(match.task.bddl_file).objects
+    side = len(match.fit.residual)
+    residuals: list[float] = []
+    for name, pixels in frames.things(match.start, match.camera).items():
+        seen = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0
+        if name in objects and seen.sum() >= FEWEST_PX:
+            residuals.append(float(match.fit.residual[seen].mean()))
+    return bool(residuals) and float(np.median(residuals)) <= IN_PLACE
+
+
+def _search_starts(
+    match: Match, frames: StartFrames, right_state: bool, note: Callable[[str], None]
+) -> tuple[Match, tuple[Match, ...]]:
+    """Search other starts of the task; return the best match, and the others of its group that fit.
+
+    Args:
+        right_state: True if other initial states need no search.
+    """
     best = match
-    for group, starts in _starts(match.start, frames.count):
+    for group, starts in _starts(match.start, 0 if right_state else frames.count):
         note(f"searching {group}")
         tried = list(_matches(match, frames, starts))
         best = _best([best, *tried])
@@ -126,18 +164,6 @@ def _search_starts(match: Match, frames: StartFrames, note: Callable[[str], None
         seeds = [best.start._replace(seed=seed) for seed in (best.start.number, *SEEDS)]
         best = _best([best, *_matches(match, frames, seeds)])
     return best, ()
-
-
-def search_tasks(found: Found, note: Callable[[str], None]) -> Found:
-    """Search the other tasks of the suite, settled in the start of the same number."""
-    start = Start(found.match.start.number, found.match.start.seed)
-    for task in _others(found.match.task):
-        note(f"searching {task}")
-        with closing(StartFrames(task)) as frames:
-            match = _best(_matches(replace(found.match, task=task), frames, [start]))
-            if match.fit.fits:
-                return replace(found, match=match, versions=_versions(frames, match))
-    return found
 
 
 def _versions(frames: StartFrames, match: Match) -> tuple[Frame, Frame]:

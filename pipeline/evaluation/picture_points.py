@@ -18,6 +18,9 @@ TOLERANCE_PX = 2.0
 FEWEST_POINTS = 12
 """Smallest number of matched points that show where a camera is."""
 
+MANY_POINTS, MOST_POINTS = 30, 0.7
+"""Smallest number, and smallest share, of points that move together if the camera moved."""
+
 STILL_PX = 1.5
 """Largest shift of points of an unmoved camera."""
 
@@ -27,10 +30,12 @@ class Place(NamedTuple):
 
     Attributes:
         points: number of points that agree with it.
+        share: their share of all common points.
         shift_px: median distance of these points from their places in our frame.
     """
 
     points: int
+    share: float
     shift_px: float
     scale: float
     rotation_deg: float
@@ -39,6 +44,11 @@ class Place(NamedTuple):
     def still(self) -> bool:
         """Return whether the points are where they are in our frame."""
         return self.shift_px <= STILL_PX
+
+    @property
+    def moved(self) -> bool:
+        """Return whether nearly all points moved together, which things in another state do not."""
+        return not self.still and self.points >= MANY_POINTS and self.share >= MOST_POINTS
 
 
 def place(picture: Frame, frame: Frame) -> Place | None:
@@ -51,7 +61,8 @@ def place(picture: Frame, frame: Frame) -> Place | None:
         return None
     still = np.linalg.norm(theirs - ours, axis=1) <= STILL_PX
     if still.sum() >= max(FEWEST_POINTS, len(ours) / 2):
-        return Place(int(still.sum()), float(np.median(np.linalg.norm(theirs - ours, axis=1)[still])), 1.0, 0.0)
+        shift_px = float(np.median(np.linalg.norm(theirs - ours, axis=1)[still]))
+        return Place(int(still.sum()), float(still.mean()), shift_px, 1.0, 0.0)
     cv2.setRNGSeed(0)
     matrix, agree = cv2.estimateAffinePartial2D(ours, theirs, ransacReprojThreshold=TOLERANCE_PX)
     if matrix is None or agree.sum() < FEWEST_POINTS:
@@ -59,7 +70,8 @@ def place(picture: Frame, frame: Frame) -> Place | None:
     inside = agree.ravel() > 0
     shift_px = float(np.median(np.linalg.norm(theirs - ours, axis=1)[inside]))
     scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
-    return Place(int(inside.sum()), shift_px, scale, float(np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0]))))
+    rotation_deg = float(np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0])))
+    return Place(int(inside.sum()), float(inside.mean()), shift_px, scale, rotation_deg)
 
 
 def _common_points(frame: Frame, picture: Frame) -> tuple[np.ndarray, np.ndarray]:

@@ -106,6 +106,26 @@ class StartFrames:
         return renderer
 
 
+class LastStartFrames:
+    """Holder of the renderer of the last task; it closes a task's renderer before it opens that of another."""
+
+    def __init__(self) -> None:
+        self._frames: StartFrames | None = None
+
+    def of(self, task: Task) -> StartFrames:
+        """Return the renderer of a task."""
+        if self._frames is None or self._frames.task != task:
+            self.close()
+            self._frames = StartFrames(task)
+        return self._frames
+
+    def close(self) -> None:
+        """Close the renderer."""
+        if self._frames is not None:
+            self._frames.close()
+        self._frames = None
+
+
 def first_start(task: Task, number: int) -> Start:
     """Return the start of an evaluation in LIBERO's initial state with a number.
 
