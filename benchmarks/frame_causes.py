@@ -159,7 +159,7 @@ def _starts(task: str) -> Iterator[Case]:
     shift = np.array([[1.0, 0.0, 14.0], [0.0, 1.0, 8.0]])
     clean = frame("3.1.6-goal-agentview")
     moved = cv2.warpAffine(clean, shift, (256, 256), borderMode=cv2.BORDER_REFLECT)
-    yield Case("goal: camera shifted", np.asarray(moved, np.uint8), frozenset({"camera"}), task)
+    yield Case("goal: camera shifted", np.asarray(moved, np.uint8), frozenset({"camera_pose"}), task)
 
 
 def _further(clean: Image, task: str) -> Iterator[Case]:

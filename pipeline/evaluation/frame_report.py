@@ -35,7 +35,7 @@ from pipeline.types import Frame, Task
 
 Cause = Literal[
     "size", "shape", "orientation", "channels", "view", "zoom", "mujoco", "brightness", "not_settled", "gripper",
-    "reset_seed", "initial_state", "task", "camera", "things", "colours", "unknown",
+    "reset_seed", "initial_state", "task", "camera_pose", "things", "colours", "unknown",
 ]  # fmt: skip
 """Kind of a difference."""
 
@@ -351,7 +351,7 @@ def _unmatched(found: Found, opened: LastStartFrames) -> Iterator[Finding]:
     if not placed.still:
         carrier = " or of the hand, which carries it" if match.camera == CAMERA_OF_VIEW["wrist"] else ""
         yield Finding(
-            "camera",
+            "camera_pose",
             f"{placed.points} points of our frame are elsewhere: shifted by {placed.shift_px:.0f} pixels of {SIZE_PX}, "
             f"{placed.scale:.2f} times as large, rotated by {placed.rotation_deg:.0f} degrees. The pose of the camera"
             f"{carrier} differs; {left}",

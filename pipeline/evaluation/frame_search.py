@@ -20,7 +20,7 @@ from pipeline.libero import tasks as libero_tasks
 from pipeline.types import Frame, Task
 
 UNSETTLED = range(SETTLING_STEPS - 2)
-"""Numbers of settling steps whose frames can be told from the settled frame."""
+"""Numbers of settling steps whose frames differ from the settled frame."""
 
 GRIPPERS = (1.0, 0.0)
 """Other commands of the gripper while settling: close, and none."""
