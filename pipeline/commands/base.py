@@ -42,7 +42,7 @@ class Listed(NamedTuple):
     """Place of a command, and its line in the help of its group.
 
     Attributes:
-        module: module of ``pipeline.commands``; it has the command under its name.
+        module: module of ``pipeline.commands``; it has the command under its name, with _ in place of -.
     """
 
     module: str
@@ -73,7 +73,7 @@ class LazyGroup(click.Group):
         for commands in self.sections.values():
             if name in commands:
                 module = importlib.import_module(f"pipeline.commands.{commands[name].module}")
-                command: click.Command = getattr(module, name)
+                command: click.Command = getattr(module, name.replace("-", "_"))
                 return command
         if name in self.moved:
             raise click.UsageError(f"the command `{name}` is now `{self.moved[name]}`", context)

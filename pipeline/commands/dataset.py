@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ dataset = LazyGroup(
         "Commands": {
             "check": Listed("dataset", "Compare all files of a run with their checksums."),
             "audit": Listed("dataset", "Measure how close any dataset comes to the test tasks."),
+            "compare-frame": Listed("dataset", "Compare the first observation of your evaluation with ours."),
             "regenerate": Listed("dataset", "Generate one episode again, and compare it byte for byte."),
             "push": Listed("dataset", "Upload a dataset with its card to the Hugging Face hub."),
         }
@@ -88,6 +90,46 @@ def audit(dataset: Path, manifest: Path | None) -> int:
         print(f"{axis}: unknown for {number:,} of {result.episodes:,} episodes, without labels, text or a known task")
     print(json.dumps(asdict(result) | {"unknown": result.unknown}))
     return int(any(finding.overlaps for finding in result.axes.values()))
+
+
+@click.command(
+    "compare-frame", cls=Command, epilog=example("dataset compare-frame first.png libero_goal/turn_on_the_stove")
+)
+@click.argument("picture", metavar="PICTURE", type=PATH, help="PNG or JPEG file of the image that the policy gets.")
+@click.argument("task", metavar="SUITE/TASK", help="Task of the evaluation, such as libero_goal/turn_on_the_stove.")
+@click.option(
+    "--init-state", metavar="K", type=click.IntRange(min=0), default=0, help="LIBERO's initial state (default: 0)."
+)
+@click.option(
+    "--view",
+    type=click.Choice(("agentview", "wrist")),
+    default="agentview",
+    help="View that the picture should show (default: agentview).",
+)
+@click.option("--sheet", metavar="FILE", type=PATH, help="New PNG file: the picture, our frame and their difference.")
+@click.option("--json", "as_json", is_flag=True, help="Print the report as one line of JSON.")
+def compare_frame(picture: Path, task: str, init_state: int, view: str, sheet: Path | None, as_json: bool) -> int:
+    """Compare the first observation of your own evaluation with the frame of the datasets.
+
+    Save the image that the policy gets after LIBERO's reset, initial state K and ten settling steps. The command
+    renders this frame and reports each difference with a remedy: size, rotation, colours, camera, MuJoCo's version,
+    start and task. A difference is reported if its undoing fits, and no other view or orientation comes close. The exit
+    status is 1 if the frames differ.
+    """
+    from contextlib import closing
+
+    from pipeline.evaluation import frame_report
+    from pipeline.evaluation.start_frames import LastStartFrames
+    from pipeline.libero.tasks import find_task, select_tasks
+
+    suite, _, name = task.partition("/")
+    found = find_task(suite, name) if name else select_tasks([task])[0]
+    with closing(LastStartFrames()) as opened:
+        report = frame_report.compare_frame(picture, found, init_state, view, opened, partial(print, file=sys.stderr))
+    if sheet is not None:
+        frame_report.write_sheet(report, sheet)
+    print(json.dumps(report.as_json()) if as_json else "\n".join(report.lines()))
+    return int(not report.equal)
 
 
 @click.command(cls=Command, epilog=example("dataset regenerate 0123456789abcdef configs/starter.yaml --out again"))

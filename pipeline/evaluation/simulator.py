@@ -96,7 +96,13 @@ class Simulator(Environment):
         """Return robosuite's controller of the arm."""
         return self._env.env.robots[0].controller
 
-    def start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
+    def start(
+        self,
+        seed: int,
+        state: Floats,
+        posture_rad: tuple[float, ...] | None = None,
+        settling_steps: int = SETTLING_STEPS,
+    ) -> None:
         """Reset, set an initial state and settle, as in the benchmarks' evaluations.
 
         Args:
@@ -106,6 +112,7 @@ class Simulator(Environment):
             posture_rad: (7,) joint angles of the arm in the reset; LIBERO's own by default. The state moves the arm
                 at once. But the controller keeps the goal orientation and the null-space posture of the reset, and
                 drives the arm to them.
+            settling_steps: number of control steps before the first observation.
         """
         env = self._env.env
         self._push = None
@@ -123,7 +130,7 @@ class Simulator(Environment):
         env.sim.forward()
         env._post_process()
         self._observe_from_here()
-        self.settle(SETTLING_STEPS)
+        self.settle(settling_steps)
 
     def start_scene(self, scene: Scene) -> None:
         """Restore a scene that does not come from LIBERO's reset, such as a perturbed scene, and settle."""

@@ -3,7 +3,8 @@
 All conventions follow ``schemas/episode.json``.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -27,10 +28,13 @@ NOTHING, ROBOT, GRIPPER, FLOOR, WALL, ROOM, TABLE = range(len(COMMON))
 
 
 class Instances:
-    """Table of a trajectory's instance names, and the bodies, geoms and sites of each name.
+    """Table of a scene's instance names, and the bodies, geoms and sites of each name.
 
     After ``COMMON`` come the fixtures and then the objects, in the order and under the names of the task's BDDL file.
     Thus an id has one meaning in all episodes of a task. Objects that a perturbation added come last.
+
+    Args:
+        resolved: the scene's ``Scene.resolved``, which names added objects.
 
     Attributes:
         names: the name of each id.
@@ -40,10 +44,10 @@ class Instances:
         PipelineError: if the scene has more things than ``object_poses`` and ``boxes`` have rows.
     """
 
-    def __init__(self, model: mujoco.MjModel, trajectory: Trajectory, task: Task):
+    def __init__(self, model: mujoco.MjModel, task: Task, resolved: Mapping[str, Any] = MappingProxyType({})):
         problem = bddl.read(task.bddl_file)
         things = problem.things
-        self.names: tuple[str, ...] = (*COMMON, *things, *added_names(trajectory.scene.resolved))
+        self.names: tuple[str, ...] = (*COMMON, *things, *added_names(resolved))
         rows = SCHEMA.object_poses.shape[0]
         if len(self.names) > rows:
             raise PipelineError(f"a scene of {task.name} has {len(self.names)} things", expected=f"{rows} or fewer")

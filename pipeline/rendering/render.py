@@ -38,7 +38,8 @@ def render(
     colours share their geometry.
     """
     renderer = opened.renderer(trajectory.model_xml, render_config.size_px)
-    instances = Instances(renderer.model, trajectory, task) if render_config.content.has_names else None
+    has_names = render_config.content.has_names
+    instances = Instances(renderer.model, task, trajectory.scene.resolved) if has_names else None
     steps = range(len(trajectory.actions))
     renderer.restore(first_posture(trajectory.scene, renderer.model), trajectory.site_alpha[0])
     first_grip = grip_pose(renderer.data)

@@ -1,0 +1,400 @@
+"""Report of the differences between a user's first observation and ours, each with its remedy."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.errors import PipelineError
+from pipeline.evaluation.frame_search import CLEAR, FEWEST_PX, Found, Match, middle, search
+from pipeline.evaluation.picture_fit import (
+    FITTING,
+    SIZE_PX,
+    UPRIGHT,
+    Orientation,
+    Smooth,
+    Variant,
+    difference,
+    fit,
+    read_picture,
+    smoothed,
+    variants,
+)
+from pipeline.evaluation.picture_points import place
+from pipeline.evaluation.simulator import SETTLING_STEPS
+from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
+from pipeline.files import replaced
+from pipeline.images.jpeg import encode_exactly, resized
+from pipeline.rendering.srgb import FIRST_VERSION
+from pipeline.types import Frame, Task
+
+Cause = Literal[
+    "size", "shape", "orientation", "channels", "view", "zoom", "mujoco", "brightness", "not_settled", "gripper",
+    "reset_seed", "initial_state", "task", "camera_pose", "things", "colours", "unknown",
+]  # fmt: skip
+"""Kind of a difference."""
+
+BRIGHTNESS = 0.04
+"""Largest difference of a brightness from 1 that JPEG files and renderers cause."""
+
+DECODED_PX = 40
+"""Smallest number of pixels that show the textures of another MuJoCo."""
+
+DECODED_LEVELS = 4
+"""Smallest difference of such a pixel between the two versions, after smoothing."""
+
+SAME_RESIZING = 1.5
+"""Largest mean difference from our frame, resized by the same method."""
+
+RAMEKIN = "pick_up_the_black_bowl_on_the_ramekin_and_place_it_on_the_plate"
+"""Task whose bowl slides off the ramekin from MuJoCo 3.4.0 on (huggingface/lerobot#4390)."""
+
+BACKGROUND = ("nothing", "floor", "wall", "room", "table")
+"""Instances that do not move."""
+
+PIN = "install mujoco==3.2.7 (docs/evaluation.md has the command for each evaluation code)"
+SETTLE = f"take {SETTLING_STEPS} steps with the action [0, 0, 0, 0, 0, 0, -1] before the first observation"
+
+OPENCV_RESIZING = {
+    "OpenCV's INTER_NEAREST": cv2.INTER_NEAREST,
+    "OpenCV's INTER_LINEAR": cv2.INTER_LINEAR,
+    "OpenCV's INTER_AREA": cv2.INTER_AREA,
+    "OpenCV's INTER_CUBIC": cv2.INTER_CUBIC,
+    "OpenCV's INTER_LANCZOS4": cv2.INTER_LANCZOS4,
+}
+PILLOW_RESIZING = {
+    "Pillow's BILINEAR": Image.Resampling.BILINEAR,
+    "Pillow's BICUBIC": Image.Resampling.BICUBIC,
+    "Pillow's LANCZOS": Image.Resampling.LANCZOS,
+}
+"""Methods of resizing; Pillow's smooth before they reduce."""
+
+
+class Finding(NamedTuple):
+    """A difference.
+
+    Attributes:
+        what: the difference and its measured size, one or more sentences.
+        remedy: the change to the user's environment.
+    """
+
+    cause: Cause
+    what: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """Result of a comparison.
+
+    Attributes:
+        difference: mean absolute difference of the picture from our frame in grey levels; the picture is resized to
+            the frame's size, and not changed in any other way.
+    """
+
+    difference: float
+    findings: tuple[Finding, ...]
+    found: Found
+
+    @property
+    def equal(self) -> bool:
+        """Return whether nothing differs."""
+        return not self.findings
+
+    def lines(self) -> list[str]:
+        """Return the report in sentences."""
+        match = self.found.match
+        text = [f"mean difference from our frame: {self.difference:.1f} of 255 grey levels"]
+        for finding in self.findings:
+            text += [f"{finding.cause}: {finding.what}", f"  try: {finding.remedy}"]
+        if self.equal:
+            text.append("equal: view, orientation, size, colours and start are those of our frame")
+        elif match.fit.fits:
+            text.append(f"with all of this undone, the mean difference is {match.fit.error:.1f}")
+        if match.fit.fits and _decoded_pixels(self.found).sum() < DECODED_PX:
+            text.append("this picture cannot tell MuJoCo 3.2.7 from later versions; a picture of libero_object can")
+        return text
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the report for ``json.dumps``."""
+        match = self.found.match
+        return {
+            "equal": self.equal,
+            "difference": round(self.difference, 2),
+            "findings": [finding._asdict() for finding in self.findings],
+            "match": {
+                "fits": match.fit.fits,
+                "difference": round(match.fit.error, 2),
+                "largest_in_patch": round(match.fit.worst, 1),
+                "task": str(match.task),
+                "camera": match.camera,
+                "orientation": match.variant.orientation.words,
+                "start": match.start._asdict(),
+                "zoom": round(match.zoom, 3),
+            },
+        }
+
+
+def compare_frame(
+    file: Path, task: Task, number: int, view: str, opened: LastStartFrames, note: Callable[[str], None]
+) -> Report:
+    """Compare a picture of the first observation with our frame of an initial state of LIBERO.
+
+    Args:
+        number: number of the initial state.
+        view: ``agentview`` or ``wrist``.
+        note: function that reports progress.
+
+    Raises:
+        PipelineError: if the file is no picture that can be compared, or if there is no such initial state.
+    """
+    picture, start = read_picture(file), first_start(task, number)
+    found = search(picture, task, start, view, opened, note)
+    findings = (*_picture_findings(picture, found), *_scene_findings(found, start, view, opened))
+    return Report(_raw_difference(picture, found.expected), findings, found)
+
+
+def write_sheet(report: Report, file: Path) -> None:
+    """Write the picture, our frame and their difference side by side as a PNG file.
+
+    The picture is undone as the report states; the difference is four times as bright.
+
+    Raises:
+        PipelineError: if the file exists.
+    """
+    if file.exists():
+        raise PipelineError("the file exists", where=file, expected="a new file", remedy="name another file")
+    match = report.found.match
+    picture = resized(match.variant.pixels, SIZE_PX, SIZE_PX)
+    apart = np.abs(picture.astype(np.int16) - match.frame.astype(np.int16))
+    panels = [picture, match.frame, np.minimum(4 * apart, 255).astype(np.uint8)]
+    with replaced(file) as unfinished:
+        unfinished.write_bytes(encode_exactly(np.hstack(panels)[..., ::-1]))
+
+
+def _raw_difference(picture: Frame, frame: Frame) -> float:
+    """Return the mean absolute difference of a picture from a frame, resized and otherwise unchanged."""
+    return difference(_variant(picture, UPRIGHT, swapped=False).pixels, frame)
+
+
+def _variant(picture: Frame, orientation: Orientation, swapped: bool, shape: str | None = None) -> Variant:
+    """Return a variant of a picture; by default of the first shape that it may have."""
+    for variant in variants(picture):
+        if (variant.orientation, variant.swapped) == (orientation, swapped) and shape in (None, variant.shape):
+            return variant
+    raise ValueError(f"the picture has no shape {shape}")
+
+
+def _picture_findings(picture: Frame, found: Found) -> Iterator[Finding]:
+    """Yield the differences of the picture itself: size, shape, orientation, channels, crop."""
+    match = found.match
+    height, width, _ = picture.shape
+    if (height, width) != (SIZE_PX, SIZE_PX):
+        yield Finding(
+            "size",
+            f"the picture has {width} x {height} pixels, our frame {SIZE_PX} x {SIZE_PX}{_resizing(picture, match)}",
+            f"set camera_heights and camera_widths to {SIZE_PX}, or resize as in training",
+        )
+    if not (found.clear or match.fit.fits):
+        return
+    seen = match.variant
+    if seen.shape != "square":
+        content = {"stretched": "its content is stretched", "widened": "it shows more on two sides"}[seen.shape]
+        yield Finding("shape", f"the picture is not square: {content}", "set equal heights and widths")
+    if seen.orientation is not UPRIGHT:
+        before = fit(_variant(picture, UPRIGHT, seen.swapped, seen.shape).smooth, match.frame).error
+        yield Finding(
+            "orientation",
+            f"the picture is {seen.orientation.words} ({_change(before, match)})",
+            f"give the policy {seen.orientation.code}",
+        )
+    if seen.swapped:
+        before = fit(_variant(picture, seen.orientation, False, seen.shape).smooth, match.frame).error
+        yield Finding(
+            "channels",
+            f"red and blue are exchanged ({_change(before, match)})",
+            "give the policy image[..., ::-1]; nothing if only the file is wrong, as cv2.imwrite expects BGR",
+        )
+    if match.zoom != 1:
+        share = 100 * min(match.zoom, 1 / match.zoom)
+        parts = f"the middle {share:.0f} % of our frame" if match.zoom > 1 else "more than our frame"
+        before = fit(seen.smooth, match.frame).error
+        yield Finding(
+            "zoom",
+            f"things are {match.zoom:.2f} times as large ({_change(before, match)}): the picture shows {parts}, by a "
+            "crop or another field of view",
+            "crop as in training, or not at all, and keep LIBERO's field of view",
+        )
+
+
+def _change(before: float, match: Match) -> str:
+    """State the difference that a cause explains."""
+    return f"mean difference {match.fit.error:.1f} instead of {before:.1f} grey levels with this undone"
+
+
+def _resizing(picture: Frame, match: Match) -> str:
+    """Name the resizing of our frame that gives the picture, if exactly one does."""
+    if not match.fit.fits or match.variant.shape != "square" or match.zoom != 1:
+        return ""
+    full = match.variant.orientation.undo(picture[..., ::-1] if match.variant.swapped else picture).astype(np.int16)
+    side = len(full)
+    errors: dict[str, float] = {}
+    for name, method in OPENCV_RESIZING.items():
+        errors[name] = float(np.abs(full - cv2.resize(match.frame, (side, side), interpolation=method)).mean())
+    for name, filter_ in PILLOW_RESIZING.items():
+        ours = np.asarray(Image.fromarray(match.frame).resize((side, side), filter_))
+        errors[name] = float(np.abs(full - ours).mean())
+    best, second = sorted(errors, key=lambda name: errors[name])[:2]
+    if errors[best] <= SAME_RESIZING and errors[best] <= CLEAR * errors[second]:
+        return f", resized by {best} ({errors[best]:.1f} grey levels)"
+    return ", resized or rendered in this size"
+
+
+def _scene_findings(found: Found, start: Start, view: str, opened: LastStartFrames) -> Iterator[Finding]:
+    """Yield the differences of the scene: camera, MuJoCo, light, start, task."""
+    match = found.match
+    trusted = found.clear or match.fit.fits
+    if trusted and match.camera != CAMERA_OF_VIEW[view]:
+        names = {camera: name for name, camera in CAMERA_OF_VIEW.items()}
+        yield Finding(
+            "view",
+            f"the picture shows the camera {match.camera}"
+            + (f", the view {names[match.camera]}" if match.camera in names else "")
+            + f", not {CAMERA_OF_VIEW[view]} (mean difference {match.fit.error:.1f} grey levels)",
+            f"give the policy {CAMERA_OF_VIEW[view]}_image",
+        )
+    if not match.fit.fits:
+        yield from _unmatched(found, opened)
+        return
+    yield from _version(found)
+    if abs(match.fit.brightness - 1) > BRIGHTNESS:
+        yield Finding(
+            "brightness",
+            f"the whole picture has {match.fit.brightness:.2f} times the brightness of our frame",
+            "leave out changes of brightness, gamma and light",
+        )
+    yield from _start_findings(found, start)
+
+
+def _version(found: Found) -> Iterator[Finding]:
+    """Report the MuJoCo whose textures the picture shows, from the pixels that differ between versions."""
+    match = found.match
+    own, decoded = (_smooth_as(match, frame) for frame in found.versions)
+    shown = _decoded_pixels(found)
+    if shown.sum() < DECODED_PX:
+        return
+    picture = match.variant.smooth / match.fit.brightness
+    from_own, from_decoded = (float(np.abs(picture - frame)[shown].mean()) for frame in (own, decoded))
+    if from_decoded <= from_own / 2:
+        darker = float((own - picture)[shown].mean())
+        yield Finding(
+            "mujoco",
+            f"{100 * shown.mean():.1f} % of the pixels, most of them floor, are darker by {darker:.0f} grey levels. "
+            f"They differ by {from_decoded:.1f} from MuJoCo {FIRST_VERSION} and later, and by {from_own:.1f} from "
+            "MuJoCo 3.2.7",
+            PIN,
+        )
+
+
+def _decoded_pixels(found: Found) -> NDArray[np.bool_]:
+    """Return a mask (S, S) of the pixels that show the textures' version."""
+    own, decoded = (_smooth_as(found.match, frame) for frame in found.versions)
+    return np.asarray(np.abs(own - decoded).max(axis=2) > DECODED_LEVELS)
+
+
+def _smooth_as(match: Match, frame: Frame) -> Smooth:
+    """Return our frame smoothed, in the size of the picture."""
+    side = len(match.variant.pixels)
+    return smoothed(resized(middle(frame, 1 / match.zoom) if match.zoom > 1 else frame, side, side))
+
+
+def _start_findings(found: Found, start: Start) -> Iterator[Finding]:
+    """Yield the differences of the start and of the task."""
+    match = found.match
+    before = f"mean difference {match.fit.error:.1f} grey levels"
+    other_steps = sorted(other.start.steps for other in (match, *found.others) if other.start.gripper == start.gripper)
+    if match.start.gripper != start.gripper:
+        command = {1.0: "closed", 0.0: "without a command"}[match.start.gripper]
+        yield Finding("gripper", f"the gripper was {command} while the scene settled ({before})", SETTLE)
+    elif match.start.steps != start.steps:
+        steps = " or ".join(map(str, other_steps))
+        yield Finding("not_settled", f"the scene has settled for {steps} of {start.steps} steps ({before})", SETTLE)
+    if match.start.number != start.number:
+        yield Finding(
+            "initial_state",
+            f"the picture shows LIBERO's initial state {match.start.number}, not {start.number} ({before})",
+            f"env.set_init_state(states[{start.number}]) after env.reset()",
+        )
+    if match.start.seed != start.seed:
+        yield Finding(
+            "reset_seed",
+            f"the fixtures stand as after a reset with seed {match.start.seed}, not {start.seed} ({before})",
+            f"nothing, as LIBERO's demonstrations vary likewise; our frame needs env.seed({start.seed})",
+        )
+    if match.task.name != found.task.name:
+        yield Finding("task", f"the picture shows the task {match.task.name} ({before})", f"open {found.task.name}")
+
+
+def _unmatched(found: Found, opened: LastStartFrames) -> Iterator[Finding]:
+    """Report a picture that no start of the scene fits: a moved camera, moved things, other colours, or nothing."""
+    match = found.match
+    left = f"the best match leaves {match.fit.error:.1f} grey levels, {match.fit.worst:.0f} in a patch of 16 pixels"
+    placed = place(match.variant.pixels, match.frame)
+    if placed is None or not (found.clear or placed.still or placed.moved):
+        yield Finding("unknown", f"nothing explains the picture; {left}", "check the task and the camera")
+        return
+    if not placed.still:
+        carrier = " or of the hand, which carries it" if match.camera == CAMERA_OF_VIEW["wrist"] else ""
+        yield Finding(
+            "camera_pose",
+            f"{placed.points} points of our frame are elsewhere: shifted by {placed.shift_px:.0f} pixels of {SIZE_PX}, "
+            f"{placed.scale:.2f} times as large, rotated by {placed.rotation_deg:.0f} degrees. The pose of the camera"
+            f"{carrier} differs; {left}",
+            "keep LIBERO's camera agentview and its field of view",
+        )
+        return
+    apart = _things_apart(match, opened)
+    if match.task.name == RAMEKIN and apart and not {"robot", "gripper"} & apart.keys():
+        yield Finding(
+            "mujoco",
+            f"{_listed(apart)} lie elsewhere. From MuJoCo 3.4.0 on, the bowl slides off the ramekin "
+            f"(huggingface/lerobot#4390); no other start fits, {left}",
+            PIN,
+        )
+    elif apart:
+        yield Finding(
+            "things",
+            f"the camera is ours ({placed.points} points), but {_listed(apart)} differ. None of LIBERO's initial "
+            f"states, numbers of settling steps and tried seeds fits; {left}",
+            f"env.set_init_state after env.reset(), then {SETTLE}",
+        )
+    else:
+        yield Finding(
+            "colours",
+            f"the camera is ours ({placed.points} points), but light or textures differ; {left}",
+            "use LIBERO's own scene files, light and textures",
+        )
+
+
+def _listed(apart: dict[str, float]) -> str:
+    """List things with their differences."""
+    return ", ".join(f"{name} ({level:.0f} grey levels)" for name, level in apart.items())
+
+
+def _things_apart(match: Match, opened: LastStartFrames) -> dict[str, float]:
+    """Return the robot and the movable things that differ, with the mean difference of their pixels, largest first."""
+    side = len(match.fit.residual)
+    things = opened.of(match.task).things(match.start, match.camera)
+    apart: dict[str, float] = {}
+    for name, pixels in things.items():
+        seen = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0
+        if name not in BACKGROUND and seen.sum() >= FEWEST_PX:
+            level = float(match.fit.residual[seen].mean())
+            if level > FITTING:
+                apart[name] = level
+    return dict(sorted(apart.items(), key=lambda item: -item[1]))
