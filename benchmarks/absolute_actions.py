@@ -1,12 +1,12 @@
 """Success of absolute actions in LIBERO's own environment, compared with the deltas of the same trajectories.
 
-    nice -n 10 python benchmarks/absolute_actions.py data/starter [--limit 10]
+    nice -n 10 python benchmarks/absolute_actions.py data/starter [--limit 10] [--deltas] [--double]
 
 The folder belongs to a run whose stages ``plan`` and ``replay`` are finished. Each kept trajectory starts where its
 replay started, settles, and gets its actions as goals of the controller, rounded to float32 as in the datasets:
-robosuite executes them with ``use_delta = False``. The name of each trajectory that misses the goal is printed. The
-last line is JSON: trajectories tried and successful, and the largest distances (median and maximum over trajectories)
-between the two paths of the hand.
+robosuite executes them with ``use_delta = False``. ``--deltas`` executes the deltas instead, ``--double`` does not
+round. The name of each trajectory that misses the goal is printed. The last line is JSON: trajectories tried and
+successful, and the largest distances (median and maximum over trajectories) between the two paths of the hand.
 """
 
 import argparse
@@ -28,6 +28,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="a run's folder")
     parser.add_argument("--limit", type=int, help="trajectories; all when left out")
+    parser.add_argument("--deltas", action="store_true", help="execute the deltas instead of their goals")
+    parser.add_argument("--double", action="store_true", help="execute the actions without rounding them to float32")
     arguments = parser.parse_args()
     env, task = None, None
     distances_m, tried, reached = [], 0, 0
@@ -36,8 +38,10 @@ def main() -> None:
             env = opened(done.task)
         task = done.task
         first_grip, grips = replayed_grips(done.scene, done.states)
-        goals = absolute_actions(done.actions, first_grip, grips[:-1]).astype(np.float32)
-        success, hand_m = executed(env, done, goals.astype(float))
+        actions = done.actions if arguments.deltas else absolute_actions(done.actions, first_grip, grips[:-1])
+        if not arguments.double:
+            actions = actions.astype(np.float32).astype(float)
+        success, hand_m = executed(env, done, actions, use_delta=arguments.deltas)
         replayed_m = np.stack([grip.position_m for grip in grips[1:]])
         distance_m = float(np.linalg.norm(hand_m - replayed_m, axis=1).max())
         tried, reached = tried + 1, reached + success
@@ -50,21 +54,21 @@ def main() -> None:
     print(json.dumps(figures))
 
 
-def executed(env: Any, done: Done, goals: Floats) -> tuple[bool, Floats]:
-    """Execute goals (K, 7); return whether the task's goal is reached, and the hand's positions (K, 3) in m."""
+def executed(env: Any, done: Done, actions: Floats, *, use_delta: bool) -> tuple[bool, Floats]:
+    """Execute goals or deltas (K, 7); return whether the task's goal is reached, and the hand's positions (K, 3) in m."""
     put_in(env, done.scene)
     for _ in range(round((done.states[0, 0] - done.scene.state[0]) / STEP_S)):
         env.step([0.0] * 6 + [-1.0])
     assert np.array_equal(env.get_sim_state(), done.states[0]), "another first state"
     controller = env.env.robots[0].controller
-    controller.use_delta = False
+    controller.use_delta = use_delta
     positions_m = []
-    for number, goal in enumerate(goals, 1):
+    for number, action in enumerate(actions, 1):
         push = done.scene.push
         if push is not None:
             acts = push.first_step < number <= push.first_step + push.steps
             env.sim.data.xfrc_applied[env.sim.model.body_name2id(push.body)] = push.wrench if acts else 0.0
-        env.step(goal)
+        env.step(action)
         # After a step, sites are those of one substep before: 2 ms, or 2 mm at 1 m/s.
         positions_m.append(env.sim.data.get_site_xpos("gripper0_grip_site").copy())
     controller.use_delta = True

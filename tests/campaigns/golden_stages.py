@@ -106,7 +106,8 @@ def checks() -> dict[str, Any]:
     swapped = {(view, t): decoded[second_view, t] for t in sampled(steps)}
     negated = {name: replace(seen, intrinsics=-seen.intrinsics) for name, seen in made.geometry.items()}
     marks = {"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz}
-    stored = replace(made, instruction="task_1", provenance={name: row[name] for name in SCHEMA.provenance})
+    stated = {name: row[name] for name in SCHEMA.provenance}
+    stored = replace(made, instruction="task_1", provenance=stated, replay=None)
     whole = Copy("whole", stored, ["task_1"] * steps, decoded, marks, {"place": 1})
     wrong = Copy(
         dataset="wrong",
