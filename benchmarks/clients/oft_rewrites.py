@@ -28,7 +28,7 @@ def labels_in(manifest: Path) -> set[tuple[str, ...]]:
 
 
 def figures(data: Any, samples: int, labels: set[tuple[str, ...]]) -> dict[str, Any]:
-    """Draw samples from a dataset of OFT, and count the replaced instructions.
+    """Read samples from a dataset of OFT, and count the replaced instructions.
 
     Raises:
         ValueError: if a sample has labels of no episode, or gets a text that its episode does not allow.
@@ -42,9 +42,16 @@ def figures(data: Any, samples: int, labels: set[tuple[str, ...]]) -> dict[str, 
         text = data.batch_transform(raw)["task"]["language_instruction"].decode()
         if text not in lines:
             raise ValueError(f"{text!r} is no rewrite of {lines[0]!r}")
-        counts["own instruction" if text == lines[0] else "rewrite"] += 1
+        if len(lines) > 1:
+            counts["own instruction" if text == lines[0] else "rewrite"] += 1
         texts.add(text)
-    return {"samples": samples, "share": round(counts["rewrite"] / samples, 4), "distinct texts": len(texts)}
+    with_rewrites = counts.total()
+    return {
+        "samples": samples,
+        "samples of episodes with rewrites": with_rewrites,
+        "share of these with a rewrite": round(counts["rewrite"] / with_rewrites, 4),
+        "distinct texts": len(texts),
+    }
 
 
 def main() -> None:

@@ -69,7 +69,7 @@ def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iter
 
 
 def subtasks(case: Case) -> Iterator[Fault]:
-    """Compare the stored subtasks with those that follow from the states of the replay alone."""
+    """Compute the subtasks again from the states of the replay alone, and compare them with the stored ones."""
     expected = find_subtasks(case.trajectory, find_task(case.row["suite"], case.row["task"]))
     if tuple(case.made.subtasks) != expected:
         yield case.finding("frames", f"subtasks {list(case.made.subtasks)}", list(expected))
