@@ -4,26 +4,26 @@ The script records both with this project on Python 3.12 or 3.13. A scripted pol
 from LIBERO's first initial state, and must succeed. OUT/delta has its actions, OUT/absolute the goals that they set for
 the controller:
 
-    python benchmarks/clients/replay_policy.py libero_goal put_the_bowl_on_the_plate OUT
+    python benchmarks/clients/replay_policy.py libero_goal turn_on_the_stove OUT
 
 Then stock lerobot-eval runs either policy in the same episode, after the ``export`` lines of ``docs/evaluation.md``:
 
     export PYTHONPATH=.:benchmarks/clients
     lerobot-eval --policy.discover_packages_path=replay_policy --policy.path=OUT/absolute --env.actions=absolute \
         --env.discover_packages_path=pipeline.evaluation.lerobot_eval --env.type=perturbed_libero \
-        --env.task=libero_goal --env.tasks='[put_the_bowl_on_the_plate]' --eval.n_episodes=1 --eval.batch_size=1
+        --env.task=libero_goal --env.tasks='[turn_on_the_stove]' --eval.n_episodes=1 --eval.batch_size=1
 """
 
 import sys
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.pretrained import PreTrainedPolicy
 
 __path__: list[str] = []  # lerobot searches the imported package for modules
@@ -35,6 +35,7 @@ class ReplayConfig(PreTrainedConfig):
     """Number of recorded actions; lerobot finds the class ``ReplayPolicy`` by this class's name."""
 
     steps: int = 1
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
     observation_delta_indices = None
     action_delta_indices = None
     reward_delta_indices = None
