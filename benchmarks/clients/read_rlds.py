@@ -19,6 +19,7 @@ import shutil
 import sys
 import tempfile
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ def main(root: Path) -> None:
     columns = {"action": np.concatenate(steps["action"]), "proprio": np.concatenate(steps["state"])}
     gripper = np.clip(columns["action"][:, 6], 0, 1)
     columns["action"] = np.concatenate([columns["action"][:, :6], 1 - gripper[:, None]], axis=1)
-    summaries = {"mean": np.mean, "std": np.std, "max": np.max, "min": np.min}
+    summaries: dict[str, Callable[..., Any]] = {"mean": np.mean, "std": np.std, "max": np.max, "min": np.min}
     for column, values in columns.items():
         for name, summary in summaries.items():
             apart = np.abs(statistics[column][name] - summary(values.astype(float), axis=0))

@@ -1,4 +1,4 @@
-"""Absolute actions and 6D rotations, as X-VLA's own loader and lerobot's X-VLA policy read them, compared with the files.
+"""Comparison of absolute actions in 6D, as X-VLA's own loader and lerobot's X-VLA policy read them, with the files.
 
 ROOT is a dataset of the format ``lerobot_openpi``, whose JPEG files X-VLA's HDF5 files take over. The first command
 writes a file for each episode, in this project's environment; the second one compares in lerobot's (0.6.1, with
@@ -16,6 +16,7 @@ The third one runs in a checkout of X-VLA, in an environment with the imports of
 import importlib
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,8 @@ def read(out: Path) -> None:
 
 def main() -> None:
     command, *folders = sys.argv[1:]
-    {"write": write, "convert": convert, "read": read}[command](*map(Path, folders))
+    commands: dict[str, Callable[..., None]] = {"write": write, "convert": convert, "read": read}
+    commands[command](*map(Path, folders))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Policy of lerobot 0.6 that repeats recorded actions, as deltas or as goals, to check ``--env.actions`` of lerobot-eval.
+"""Policy of lerobot 0.6 that repeats recorded deltas or goals, to check ``--env.actions`` of lerobot-eval.
 
 The script records both with this project on Python 3.12 or 3.13. A scripted policy follows the task's demonstration
 from LIBERO's first initial state, and must succeed. OUT/delta has its actions, OUT/absolute the goals that they set for
@@ -31,7 +31,7 @@ __path__: list[str] = []  # lerobot searches the imported package for modules
 
 @PreTrainedConfig.register_subclass("replay")
 @dataclass
-class ReplayConfig(PreTrainedConfig):
+class ReplayConfig(PreTrainedConfig):  # type: ignore[misc]
     """Number of recorded actions; lerobot finds the class ``ReplayPolicy`` by this class's name."""
 
     steps: int = 1
@@ -50,7 +50,9 @@ class ReplayConfig(PreTrainedConfig):
         """Accept any observation, because the policy uses none."""
 
 
-class ReplayPolicy(PreTrainedPolicy):
+class ReplayPolicy(PreTrainedPolicy):  # type: ignore[misc]
+    """Policy that repeats recorded actions, whatever it observes."""
+
     config_class = ReplayConfig
     name = "replay"
     actions: torch.Tensor
