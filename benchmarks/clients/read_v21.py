@@ -16,7 +16,7 @@ openpi (15a9616) runs in the environment of its ``uv.lock`` (lerobot 0cf8648, ja
 cloud store. Offline, any SentencePiece model is good enough here: store it in ``OPENPI_DATA_HOME`` as
 ``big_vision/paligemma_tokenizer.model``. ASSETS is the recipe's ``finetune/openpi_assets``:
 
-    HF_LEROBOT_HOME=.../lerobot_v21 uv run python .../read_v21.py openpi ROOT ASSETS
+    HF_LEROBOT_HOME=.../lerobot_openpi uv run python .../read_v21.py openpi ROOT ASSETS [--data.extra-delta-transform]
 
 GR00T (N1.7, 23ace64) runs with Python 3.10, the imports of its loader, and in its checkout. Run it on the dataset as
 written. Then copy its ``examples/LIBERO/modality.json`` into ``meta``, as its page describes, and run it again:
@@ -42,7 +42,12 @@ from PIL import Image
 
 Sample = dict[str, Any]
 """``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``; samples from
-files also have ``episode`` and ``step``."""
+files also have ``absolute_action``, ``episode`` and ``step``."""
+
+EXTRA_DELTA = "--data.extra-delta-transform"
+"""openpi's option that subtracts the state from the first six numbers of an action."""
+
+NUMBERS = ("state", "action", "absolute_action")
 
 SIZE = 224
 """Height and width to which starVLA and openpi resize."""
@@ -53,15 +58,15 @@ def files(root: Path) -> Iterator[tuple[int, Sample]]:
     info = json.loads((root / "meta" / "info.json").read_text())
     tasks = [json.loads(line) for line in (root / "meta" / "tasks.jsonl").read_text().splitlines()]
     names = {"state": "observation.state", "action": "action", "image": "observation.images.image"}
-    names |= {"wrist_image": "observation.images.wrist_image"}
+    names |= {"wrist_image": "observation.images.wrist_image", "absolute_action": "absolute_action"}
     if "actions" in info["features"]:
-        names = {"state": "state", "action": "actions", "image": "image", "wrist_image": "wrist_image"}
+        names = {name: name for name in names} | {"action": "actions"}
     before = 0
     for episode in range(info["total_episodes"]):
         place = {"episode_chunk": episode // info["chunks_size"], "episode_index": episode}
         rows = pq.read_table(root / info["data_path"].format(**place)).to_pylist()
         for step in (0, len(rows) // 2, len(rows) - 1):
-            sample: Sample = {name: np.array(rows[step][names[name]]) for name in ("state", "action")}
+            sample: Sample = {name: np.array(rows[step][names[name]]) for name in NUMBERS}
             for view in ("image", "wrist_image"):
                 if info["video_path"] is None:
                     sample[view] = _opened(rows[step][names[view]]["bytes"])
@@ -88,15 +93,15 @@ def lerobot(root: Path) -> Iterator[tuple[Sample, Sample]]:
     dataset = LeRobotDataset(root.name, root=root, video_backend="pyav")
     for place, expected in files(root):
         item = {name.rpartition(".")[2].removesuffix("s"): value for name, value in dataset[place].items()}
-        read = {name: item[name].numpy() for name in ("state", "action")}
+        read = {name: item[name].numpy() for name in NUMBERS}
         read |= {view: item[view].numpy().transpose(1, 2, 0) * 255 for view in ("image", "wrist_image")}
         yield {**read, "text": item["task"]}, expected
 
 
 def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
-    """Read samples of starVLA's mixture of one dataset; yield them with the expected ones.
+    """Read samples of one dataset of starVLA's mixture; yield them with the expected ones.
 
-    starVLA normalises all action dimensions except the gripper to [-1, 1].
+    starVLA normalises all action dimensions except the gripper to [-1, 1], by the limits of the whole mixture.
     """
     from omegaconf import OmegaConf
 
@@ -111,7 +116,10 @@ def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
     settings |= {"data_root_dir": str(root.parent), "data_mix": mixture, "include_state": True}
     mixed = loader.get_vla_dataset(settings)
     (dataset,) = (member for member in mixed.datasets if member.dataset_name == root.name)
-    actions = np.concatenate([np.stack(pq.read_table(file)["action"].to_numpy()) for file in root.glob("data/*/*")])
+    tables: list[Any] = []
+    for member in mixtures[mixture]:
+        tables += [pq.read_table(file, columns=["action"]) for file in (root.parent / member[0]).glob("data/*/*")]
+    actions = np.concatenate([np.stack(table["action"].to_numpy()) for table in tables])
     low, high = actions.min(axis=0), actions.max(axis=0)
     for place, expected in files(root):
         item = dataset[place]
@@ -124,25 +132,27 @@ def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
         yield read | images, expected | views | {"action": action}
 
 
-def openpi_dataset(root: Path, assets: Path) -> tuple[Any, Any]:
+def openpi_dataset(root: Path, assets: Path, *options: str) -> tuple[Any, Any]:
     """Load openpi's configuration pi05_libero by the arguments of the recipe, and its normalised data loader."""
     config: Any = importlib.import_module("openpi.training.config")
     data_loader: Any = importlib.import_module("openpi.training.data_loader")
     sys.argv = ["train.py", "pi05_libero", "--exp-name=read", f"--data.repo-id={root.name}"]
-    sys.argv += [f"--data.assets.assets-dir={assets}", "--data.assets.asset-id=physical-intelligence/libero"]
+    sys.argv += [f"--data.assets.assets-dir={assets}", "--data.assets.asset-id=physical-intelligence/libero", *options]
     chosen = config.cli()
     prepared = chosen.data.create(chosen.assets_dirs, chosen.model)
     dataset = data_loader.create_torch_dataset(prepared, chosen.model.action_horizon, chosen.model)
     return prepared, data_loader.transform_dataset(dataset, prepared)
 
 
-def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
+def openpi(root: Path, assets: Path, *options: str) -> Iterator[tuple[Sample, Sample]]:
     """Read samples with openpi's data loader; yield them with the expected ones."""
     image_tools: Any = importlib.import_module("openpi_client.image_tools")
-    prepared, dataset = openpi_dataset(root, assets)
+    prepared, dataset = openpi_dataset(root, assets, *options)
     statistics = prepared.norm_stats
     for place, expected in files(root):
         item = dataset[place]
+        if EXTRA_DELTA in options:
+            expected["action"][:6] -= expected["state"][:6]
         for name, key in (("state", "state"), ("action", "actions")):
             low, high = statistics[key].q01, statistics[key].q99
             expected[name] = 2 * (expected[name] - low) / (high - low + 1e-6) - 1
@@ -198,13 +208,13 @@ def main() -> None:
     client, root, *further = sys.argv[1:]
     readers: dict[str, Callable[..., Iterator[tuple[Sample, Sample]]]]
     readers = {"lerobot": lerobot, "starvla": starvla, "openpi": openpi, "gr00t": gr00t}
-    furthest = dict.fromkeys(("state", "action", "image", "wrist_image"), 0.0)
+    furthest: dict[str, float] = {}
     samples = 0
-    for read, expected in readers[client](Path(root).resolve(), *map(Path, further)):
+    for read, expected in readers[client](Path(root).resolve(), *further):
         assert read["text"] == expected["text"], f"{read['text']!r} for {expected['text']!r}"
-        for name in furthest:
+        for name in read.keys() - {"text"}:
             apart = np.abs(np.asarray(read[name], float) - np.asarray(expected[name], float))
-            furthest[name] = max(furthest[name], float(apart.max()))
+            furthest[name] = max(furthest.get(name, 0.0), float(apart.max()))
         samples += 1
     print(f"{client}: {samples} steps of {root}; largest difference: {furthest}")
 
