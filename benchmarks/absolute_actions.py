@@ -55,7 +55,11 @@ def main() -> None:
 
 
 def executed(env: Any, done: Done, actions: Floats, *, use_delta: bool) -> tuple[bool, Floats]:
-    """Execute goals or deltas (K, 7); return whether the task's goal is reached, and the hand's positions (K, 3) in m."""
+    """Execute goals or deltas (K, 7).
+
+    Returns:
+        Whether the goal of the task is reached, and the positions of the hand (K, 3) in m.
+    """
     put_in(env, done.scene)
     for _ in range(round((done.states[0, 0] - done.scene.state[0]) / STEP_S)):
         env.step([0.0] * 6 + [-1.0])
