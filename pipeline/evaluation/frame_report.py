@@ -132,7 +132,7 @@ class Report:
                 "difference": round(match.fit.error, 2),
                 "largest_in_patch": round(match.fit.worst, 1),
                 "task": str(match.task),
-                "camera": match.camera,
+                "camera_name": match.camera,
                 "orientation": match.variant.orientation.words,
                 "start": match.start._asdict(),
                 "zoom": round(match.zoom, 3),

@@ -31,6 +31,9 @@ SEEDS = (0, 7, 42, 1000)
 ZOOMS = np.geomspace(0.6, 1.7, 53)
 """Sizes of things in a picture, in multiples of their sizes in our frame."""
 
+FINER = np.linspace(0.98, 1.02, 9)
+"""Further sizes to try, in multiples of the best one of ``ZOOMS``."""
+
 CLEAR = 0.8
 """Largest error of a match, in multiples of the next one's, from which it counts as the better one."""
 
@@ -108,12 +111,17 @@ def search(
         candidates += _appearances(picture, frames, start, rest)
         match, clear = _clear_best(candidates)
     if not match.fit.fits:
-        match = _best([match, *_fitting(_zooms(match))])
+        coarse = _best(_zooms(match, ZOOMS.tolist()))
+        finer = (coarse.zoom * FINER).tolist()
+        match = _best([match, *_fitting(_zooms(match, finer))])
     others: tuple[Match, ...] = ()
+    if match.fit.fits:
+        return Found(task, match, others, expected, _versions(frames, match), clear)
     placed = place(match.variant.pixels, match.frame)
     moved = placed is not None and placed.moved
-    right_state = clear and not match.fit.fits and not moved and _objects_in_place(match, frames)
-    if clear and not match.fit.fits and not moved:
+    right_state = False
+    if clear and not moved:
+        right_state = _objects_in_place(match, frames)
         match, others = _search_starts(match, frames, right_state, note)
     if match.fit.fits or moved or right_state:
         return Found(task, match, others, expected, _versions(frames, match), clear)
@@ -210,9 +218,9 @@ def _matches(like: Match, frames: StartFrames, starts: Iterable[Start]) -> Itera
         yield replace(like, start=start, frame=frame, fit=fit(like.variant.smooth, frame))
 
 
-def _zooms(match: Match) -> Iterator[Match]:
+def _zooms(match: Match, zooms: list[float]) -> Iterator[Match]:
     """Yield the match at other sizes of things: the picture is a part of the frame, or the frame is a part of it."""
-    for zoom in ZOOMS.tolist():
+    for zoom in zooms:
         if zoom > 1:
             yield replace(match, zoom=zoom, fit=fit(match.variant.smooth, middle(match.frame, 1 / zoom)))
         else:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.evaluation.picture_fit import SIZE_PX
 from pipeline.images.jpeg import resized
@@ -74,18 +75,25 @@ def place(picture: Frame, frame: Frame) -> Place | None:
     return Place(int(inside.sum()), float(inside.mean()), shift_px, scale, rotation_deg)
 
 
-def _common_points(frame: Frame, picture: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _common_points(frame: Frame, picture: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the places (N, 2) of common points in our frame and in a picture, by SIFT's descriptors."""
-    sift, places, descriptors = cv2.SIFT_create(), [], []
-    for image in (frame, picture):
-        grey = cv2.cvtColor(resized(image, SIZE_PX, SIZE_PX), cv2.COLOR_RGB2GRAY)
-        found, described = sift.detectAndCompute(grey, None)
-        places.append(np.array([point.pt for point in found], np.float32).reshape(-1, 2))
-        descriptors.append(described)
+    our_places, ours = _points(frame)
+    their_places, theirs = _points(picture)
     pairs: list[tuple[int, int]] = []
-    if all(described is not None and len(described) > 1 for described in descriptors):
-        for best, second in cv2.BFMatcher().knnMatch(*descriptors, k=2):
+    if len(ours) > 1 and len(theirs) > 1:
+        for best, second in cv2.BFMatcher().knnMatch(ours, theirs, k=2):
             if best.distance < RATIO * second.distance:
                 pairs.append((best.queryIdx, best.trainIdx))
     indices = np.array(pairs, np.intp).reshape(-1, 2)
-    return places[0][indices[:, 0]], places[1][indices[:, 1]]
+    return our_places[indices[:, 0]], their_places[indices[:, 1]]
+
+
+def _points(image: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the places (N, 2) of an image's points and their descriptors (N, 128)."""
+    grey = cv2.cvtColor(resized(image, SIZE_PX, SIZE_PX), cv2.COLOR_RGB2GRAY)
+    everywhere = np.full(grey.shape, 255, np.uint8)
+    points, descriptors = cv2.SIFT.create().detectAndCompute(grey, everywhere)
+    places = np.array([point.pt for point in points], np.float32).reshape(-1, 2)
+    # OpenCV returns None if there are no points.
+    described = np.empty((0, 128)) if len(points) == 0 else descriptors
+    return places, np.asarray(described, np.float32)
