@@ -26,12 +26,12 @@ def test_what_is_left_is_counted_in_trajectories_and_streams() -> None:
     assert not_made(rows, {}, {}) == {"replay": 1.0, "render": 1.0}
     streams = {stream.stream_id for stream in streams_of(rows[0].perturbations).values()}
     # Both views of the twin and of the robot's start, and a moved agent view for each camera, which is all 9 change.
-    left = not_made(rows, verdicts, {twin: StoredFrames("", "", "open_loop", streams)})
+    left = not_made(rows, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)})
     assert left["replay"] == 0.5
     moved = {one.stream_id for row in rows if row.axis == "camera" for one in streams_of(row.perturbations).values()}
     assert left["render"] == (len(moved - streams) + 2) / (len(moved | streams) + 2)
     alone = [replace(row, trajectory_id=twin) for row in rows if row.axis == "language"]
-    assert not_made(alone, verdicts, {twin: StoredFrames("", "", "open_loop", streams)}) == {
+    assert not_made(alone, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)}) == {
         "replay": 0.0,
         "render": 0.0,
     }

@@ -24,7 +24,7 @@ SIZE_PX = 64
 def labels_in(manifest: Path) -> set[tuple[str, ...]]:
     """Return the instruction and the rewrites of each kept episode."""
     rows = pq.read_table(manifest, columns=["kept", "instruction", "rewrites"]).to_pylist()
-    return {(row["instruction"], *row["rewrites"]) for row in rows if row["kept"]}
+    return {(row["instruction"], *json.loads(row["rewrites"])) for row in rows if row["kept"]}
 
 
 def figures(data: Any, samples: int, labels: set[tuple[str, ...]]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -13,6 +14,7 @@ from pydantic import Field, ValidationError
 
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import Where
 from pipeline.identity import DISTRIBUTION, VERSIONS, versions
@@ -72,9 +74,9 @@ class Result:
     ]
     subtask_texts: Annotated[list[str] | None, "each subtask in words; null when not rendered"]
     rewrites: Annotated[
-        list[str] | None,
-        "other wordings of the task that training may use in place of the instruction: all that the run's language "
-        "axis may sample for the episode; null when not rendered",
+        str | None,
+        "JSON list of other wordings of the task that training may use in place of the instruction: all that the run's "
+        "language axis may sample for the episode; null when not rendered",
     ]
 
 
@@ -137,7 +139,7 @@ def build(
             actions_sha256=frames.actions_sha256 if frames else None,
             subtask_starts=[subtask.step for subtask in frames.subtasks] if frames else None,
             subtask_texts=[subtask.text for subtask in frames.subtasks] if frames else None,
-            rewrites=list(rewrites(row)) if frames else None,
+            rewrites=json.dumps(list(rewrites(row))) if frames else None,
         )
         quality = {each.name: replayed.get(each.name) for each in fields(Quality)}
         place = places.get(row.episode_id, {})
@@ -180,7 +182,20 @@ def read(path: Path) -> list[dict[str, Any]]:
     Raises:
         PipelineError: when the file is missing, damaged or not a manifest of this version.
     """
-    return list(read_table(path, schema().names, MAKE_AGAIN).to_pylist())
+    rows = list(read_table(path, schema().names, MAKE_AGAIN).to_pylist())
+    # Episodes of a task have equal rewrites, of 3 kB. One copy of each is kept.
+    texts: dict[str, str] = {}
+    for row in rows:
+        row["rewrites"] = texts.setdefault(row["rewrites"], row["rewrites"])
+    return rows
+
+
+def labels_of(row: Mapping[str, Any]) -> dict[str, list[Any]] | None:
+    """Return the subtasks and rewrites of an episode's row, as the lists of a dataset; `None` if the row has none."""
+    labels = {name: row[name] for name in SCHEMA.labels}
+    if None in labels.values():
+        return None
+    return {**labels, "rewrites": json.loads(labels["rewrites"])}
 
 
 def settings(path: Path) -> Settings:

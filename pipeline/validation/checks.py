@@ -17,6 +17,7 @@ from pipeline.formats.stated_statistics import FIGURES, complete, wrong_numbers,
 from pipeline.libero import bddl
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
 from pipeline.run.manifest import OWN_VERSION
+from pipeline.run.manifest import labels_of as labels_of_row
 from pipeline.types import Frame
 from pipeline.validation.case import Case
 
@@ -169,8 +170,8 @@ def _language_entries(case: Case, train: bool) -> list[tuple[str, str, str, np.f
 
 def labels(case: Case) -> Iterator[Fault]:
     """Check the subtasks and rewrites of the manifest, and compare all copies with the manifest."""
-    stated = {name: case.row[name] for name in SCHEMA.labels}
-    if None in stated.values():
+    stated = labels_of_row(case.row)
+    if stated is None:
         yield case.finding("manifest", "has no subtasks and rewrites", "lists, which may be empty")
         return
     for what, expected in label_faults(stated, len(case.made)):

@@ -3,6 +3,7 @@
 `python -m pipeline dataset regenerate EPISODE_ID CONFIG --out FOLDER`
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -134,7 +135,7 @@ def _rebuild(
     rejected = frames_by_trajectory(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected
     if rejected:
         return None, next(iter(rejected.values()))
-    load = EpisodeLoader(out, settings.render, rewrites={row["episode_id"]: row["rewrites"]})
+    load = EpisodeLoader(out, settings.render, rewrites={row["episode_id"]: json.loads(row["rewrites"])})
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), content)
     export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")

@@ -1,6 +1,7 @@
 """Outputs of the stages after rendering for a few small inputs; ``golden.py`` records them."""
 
 import hashlib
+import json
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -100,7 +101,7 @@ def checks() -> dict[str, Any]:
     )
     row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
     row |= {"kept": True, "steps": steps + 1, "place": 1, "instruction": "task_1"}
-    row |= labels_of(made)
+    row |= {**labels_of(made), "rewrites": json.dumps(list(made.rewrites))}
     view, second_view = SCHEMA.views
     decoded = {(name, t): decode(made.frames[name][t]) for name, t in product(SCHEMA.views, sampled(steps))}
     swapped = {(view, t): decoded[second_view, t] for t in sampled(steps)}

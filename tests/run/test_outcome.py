@@ -19,7 +19,9 @@ from pipeline.run import manifest
 from pipeline.run.outcome import Outcome, missed
 from pipeline.stores.frame_store import StoredFrames
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Verdict
+from pipeline.types import Subtask, Verdict
+
+SUBTASKS = (Subtask(0, "approach the bowl"), Subtask(40, "grasp the bowl"))
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +39,8 @@ def run() -> Outcome:
         rows,
         {twin.trajectory_id: told, robot.trajectory_id: told | {"mode": "tracked", "steps": 120, "path_m": 0.75}},
         {
-            twin.trajectory_id: StoredFrames("", "a GPU", "open_loop", shown),
-            robot.trajectory_id: StoredFrames("", "a GPU", "tracked", rejected={"a stream": "too_dark"}),
+            twin.trajectory_id: StoredFrames("", "a GPU", "open_loop", "its actions", shown, subtasks=SUBTASKS),
+            robot.trajectory_id: StoredFrames("", "a GPU", "tracked", "others", rejected={"a stream": "too_dark"}),
         },
         {row.episode_id: Verdict(row.wanted, "kept" if row.wanted else "reserve_not_needed") for row in rows}
         | {robot.episode_id: Verdict(False, "too_dark")},
@@ -46,8 +48,17 @@ def run() -> Outcome:
 
 
 def table(run: Outcome, where: Where | None = None) -> list[Mapping[str, Any]]:
-    rows: list[Mapping[str, Any]] = manifest.build(run, {}, [], where).to_pylist()
+    rows: list[Mapping[str, Any]] = manifest.build(run, {}, [], where, lambda row: (f"do {row.axis}",)).to_pylist()
     return rows
+
+
+def test_rendered_episodes_alone_have_labels_and_a_name_of_their_actions(run: Outcome) -> None:
+    rendered = {"subtask_starts": [0, 40], "subtask_texts": ["approach the bowl", "grasp the bowl"]}
+    for row in table(run):
+        actions = "its actions" if row["steps"] == 90 else None
+        assert row["actions_sha256"] == actions
+        expected = {**rendered, "rewrites": [f"do {row['axis']}"]} if actions else None
+        assert manifest.labels_of(row) == expected
 
 
 def test_each_row_has_what_its_own_trajectory_and_frames_came_to(run: Outcome) -> None:
