@@ -267,7 +267,7 @@ def boxes(case: Case) -> Iterator[Fault]:
             expected = np.zeros_like(made.boxes[step])
             for place in places:
                 # OpenCV's rectangle has the first column and row, and the numbers of columns and rows.
-                expected[place] = cv2.boundingRect((ids == place).astype(np.uint8))
+                expected[place] = cv2.boundingRect(np.asarray(ids == place, np.uint8))
             wrong = np.flatnonzero(np.any(expected != made.boxes[step], axis=1))
             if len(wrong):
                 what = f"{view}_boxes of step {step} has {made.boxes[step][wrong[0]].tolist()} at place {wrong[0]}"
