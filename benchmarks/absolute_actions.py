@@ -58,7 +58,7 @@ def executed(env: Any, done: Done, actions: Floats, *, use_delta: bool) -> tuple
     """Execute goals or deltas (K, 7).
 
     Returns:
-        Whether the goal of the task is reached, and the positions of the hand (K, 3) in m.
+        True if the goal of the task is reached, and the positions of the hand (K, 3) in m.
     """
     put_in(env, done.scene)
     for _ in range(round((done.states[0, 0] - done.scene.state[0]) / STEP_S)):
