@@ -24,7 +24,7 @@ class Renderer:
     Args:
         scene: the scene's MJCF, or a compiled model, which then belongs to the renderer.
         drawing: an open ``PlainDrawing`` of the model; by default it is created.
-        size_px: height and width of the frames, if the drawing is created.
+        size_px: height and width of the frames; an open ``PlainDrawing`` has its own.
 
     Attributes:
         site_alpha: (nsite,) the sites' opacity in the first state.
