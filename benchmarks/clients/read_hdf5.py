@@ -11,6 +11,7 @@ LIBERO's reader (8f1084e) needs the same environment, and its checkout in front 
     PYTHONPATH=LIBERO ENV/bin/python benchmarks/clients/read_hdf5.py libero FILE
 """
 
+import importlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,11 +30,10 @@ LENGTH = 10
 
 def robomimic(file: Path) -> Any:
     """Open a file with robomimic's dataset of sequences."""
-    from robomimic.utils.dataset import SequenceDataset
-    from robomimic.utils.obs_utils import initialize_obs_utils_with_obs_specs
-
-    initialize_obs_utils_with_obs_specs({"obs": MODALITIES})
-    return SequenceDataset(
+    observations: Any = importlib.import_module("robomimic.utils.obs_utils")
+    observations.initialize_obs_utils_with_obs_specs({"obs": MODALITIES})
+    datasets: Any = importlib.import_module("robomimic.utils.dataset")
+    return datasets.SequenceDataset(
         str(file),
         obs_keys=(*RGB, *LOW_DIM),
         dataset_keys=("actions", "rewards", "dones", "action_absolute"),
@@ -45,9 +45,8 @@ def robomimic(file: Path) -> Any:
 
 def libero(file: Path) -> Any:
     """Open a file with the function by which LIBERO's training opens its demonstrations."""
-    from libero.lifelong.datasets import get_dataset
-
-    dataset, shapes = get_dataset(str(file), MODALITIES, seq_len=LENGTH)
+    datasets: Any = importlib.import_module("libero.lifelong.datasets")
+    dataset, shapes = datasets.get_dataset(str(file), MODALITIES, seq_len=LENGTH)
     assert shapes["all_shapes"]["agentview_rgb"][0] == 3
     return dataset
 
