@@ -115,7 +115,7 @@ def cases() -> Iterator[Case]:
 
 def _changed(suite: str, clean: Image, task: str) -> Iterator[Case]:
     """Yield cases of a changed picture."""
-    orientations = {
+    orientations: dict[str, Any] = {
         "rotated 180": cv2.rotate(clean, cv2.ROTATE_180),
         "rotated 90": cv2.rotate(clean, cv2.ROTATE_90_CLOCKWISE),
         "rotated 270": cv2.rotate(clean, cv2.ROTATE_90_COUNTERCLOCKWISE),
@@ -125,7 +125,7 @@ def _changed(suite: str, clean: Image, task: str) -> Iterator[Case]:
     }
     for name, picture in orientations.items():
         yield Case(f"{suite}: {name}", picture, frozenset({"orientation"}), task)
-    sizes = {
+    sizes: dict[str, Any] = {
         "224 by area": cv2.resize(clean, (224, 224), interpolation=cv2.INTER_AREA),
         "128 by linear": cv2.resize(clean, (128, 128), interpolation=cv2.INTER_LINEAR),
         "512 by cubic": cv2.resize(clean, (512, 512), interpolation=cv2.INTER_CUBIC),
@@ -150,12 +150,18 @@ def _starts(task: str) -> Iterator[Case]:
     for name, cause in causes.items():
         expected = {cause, "reset_seed"} if cause == "initial_state" else {cause}
         yield Case(f"goal: {name}", frame(f"3.1.6-goal-agentview-{name}"), frozenset(expected), task)
-    unsettled = cv2.rotate(frame("3.1.6-goal-agentview-steps0"), cv2.ROTATE_180)
+    unsettled = np.asarray(cv2.rotate(frame("3.1.6-goal-agentview-steps0"), cv2.ROTATE_180), np.uint8)
     yield Case("goal: steps0, rotated 180", unsettled, frozenset({"not_settled", "orientation"}), task)
     wrist = frame("3.1.6-goal-wrist")
     yield Case("goal: wrist", wrist, frozenset({"view"}), task)
     yield Case("goal: wrist as wrist", wrist, frozenset(), task, view="wrist")
-    yield Case("goal: wrist upside down", cv2.flip(wrist, 0), frozenset({"orientation"}), task, view="wrist")
+    yield Case(
+        "goal: wrist upside down",
+        np.asarray(cv2.flip(wrist, 0), np.uint8),
+        frozenset({"orientation"}),
+        task,
+        view="wrist",
+    )
     shift = np.array([[1.0, 0.0, 14.0], [0.0, 1.0, 8.0]])
     clean = frame("3.1.6-goal-agentview")
     moved = cv2.warpAffine(clean, shift, (256, 256), borderMode=cv2.BORDER_REFLECT)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.rendering.drawing import texels
 from pipeline.rendering.renderer import Renderer
@@ -38,11 +39,11 @@ def decoded(renderer: Renderer) -> Iterator[None]:
         renderer.drawing.load(textures)
 
 
-def _linear() -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
+def _linear() -> NDArray[np.uint8]:
     """Return the linear value (256,) of each sRGB value (IEC 61966-2-1)."""
     share = np.arange(256) / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return np.rint(linear * 255).astype(np.uint8)
+    return np.asarray(np.rint(linear * 255), np.uint8)
 
 
 _LINEAR = _linear()
