@@ -115,7 +115,7 @@ def cases() -> Iterator[Case]:
 
 def _changed(suite: str, clean: Image, task: str) -> Iterator[Case]:
     """Yield cases of a changed picture."""
-    orientations = {
+    orientations: dict[str, Any] = {
         "rotated 180": cv2.rotate(clean, cv2.ROTATE_180),
         "rotated 90": cv2.rotate(clean, cv2.ROTATE_90_CLOCKWISE),
         "rotated 270": cv2.rotate(clean, cv2.ROTATE_90_COUNTERCLOCKWISE),
@@ -124,8 +124,8 @@ def _changed(suite: str, clean: Image, task: str) -> Iterator[Case]:
         "transposed": cv2.transpose(clean),
     }
     for name, picture in orientations.items():
-        yield Case(f"{suite}: {name}", np.asarray(picture, np.uint8), frozenset({"orientation"}), task)
-    sizes = {
+        yield Case(f"{suite}: {name}", picture, frozenset({"orientation"}), task)
+    sizes: dict[str, Any] = {
         "224 by area": cv2.resize(clean, (224, 224), interpolation=cv2.INTER_AREA),
         "128 by linear": cv2.resize(clean, (128, 128), interpolation=cv2.INTER_LINEAR),
         "512 by cubic": cv2.resize(clean, (512, 512), interpolation=cv2.INTER_CUBIC),

@@ -30,6 +30,7 @@ from pipeline.evaluation.simulator import SETTLING_STEPS
 from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
 from pipeline.files import replaced
 from pipeline.images.jpeg import encode_exactly, resized
+from pipeline.rendering.geometry import COMMON, FLOOR, GRIPPER, NOTHING, ROBOT, ROOM, TABLE, WALL
 from pipeline.rendering.srgb import FIRST_VERSION
 from pipeline.types import Frame, Task
 
@@ -54,7 +55,7 @@ SAME_RESIZING = 1.5
 RAMEKIN = "pick_up_the_black_bowl_on_the_ramekin_and_place_it_on_the_plate"
 """Task whose bowl slides off the ramekin from MuJoCo 3.4.0 on (huggingface/lerobot#4390)."""
 
-BACKGROUND = ("nothing", "floor", "wall", "room", "table")
+BACKGROUND = tuple(COMMON[number] for number in (NOTHING, FLOOR, WALL, ROOM, TABLE))
 """Instances that do not move."""
 
 PIN = "install mujoco==3.2.7 (docs/evaluation.md has the command for each evaluation code)"
@@ -359,7 +360,7 @@ def _unmatched(found: Found, opened: LastStartFrames) -> Iterator[Finding]:
         )
         return
     apart = _things_apart(match, opened)
-    if match.task.name == RAMEKIN and apart and not {"robot", "gripper"} & apart.keys():
+    if match.task.name == RAMEKIN and apart and not {COMMON[ROBOT], COMMON[GRIPPER]} & apart.keys():
         yield Finding(
             "mujoco",
             f"{_listed(apart)} lie elsewhere. From MuJoCo 3.4.0 on, the bowl slides off the ramekin "
