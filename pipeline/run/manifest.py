@@ -75,8 +75,8 @@ class Result:
     subtask_texts: Annotated[list[str] | None, "each subtask in words; null when not rendered"]
     rewrites: Annotated[
         str | None,
-        "JSON list of other wordings of the task that training may use in place of the instruction: all that the run's "
-        "language axis may sample for the episode; null when not rendered",
+        "other wordings of the task that training may use in place of the instruction: all that the run's language "
+        "axis may sample for the episode; in the manifest a JSON list, null when not rendered",
     ]
 
 

@@ -256,14 +256,15 @@ def geometry(case: Case) -> Iterator[Fault]:
 def boxes(case: Case) -> Iterator[Fault]:
     """Compare the stored boxes with the masks of the same steps, if both are stored.
 
-    The gripper and the things with a box must be seen where the box is; other things of the goal must not be seen.
+    The masks give the boxes of the gripper and of the things that the goal names.
     """
     places = [GRIPPER, *_goal_places(case)]
     for view, made in case.made.geometry.items():
         if made.boxes is None or "segmentation" not in made.maps:
             continue
         for step in sampled(len(case.made)):
-            ids = cv2.imdecode(np.frombuffer(made.maps["segmentation"][step], np.uint8), cv2.IMREAD_UNCHANGED)
+            file = np.frombuffer(made.maps["segmentation"][step], np.uint8)
+            ids = np.asarray(cv2.imdecode(file, cv2.IMREAD_UNCHANGED))
             expected = np.zeros_like(made.boxes[step])
             for place in places:
                 # OpenCV's rectangle has the first column and row, and the numbers of columns and rows.

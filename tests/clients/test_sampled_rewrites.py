@@ -11,10 +11,8 @@ from pipeline.clients.recipe import build
 from pipeline.clients.templates.run_openvla_oft import SampledRewrites, probability_of
 
 REWRITES = (b"kindly put the bowl on the plate", b"the plate is where the bowl goes", b"place the bowl on the plate")
-SAMPLE: dict[str, Any] = {
-    "action": 1,
-    "task": {"language_instruction": b"\n".join((b"put the bowl on the plate", *REWRITES))},
-}
+TEXT = b"\n".join((b"put the bowl on the plate", *REWRITES))
+SAMPLE: dict[str, Any] = {"action": 1, "task": {"language_instruction": TEXT}}
 
 
 def texts(probability: float, key: str, sample: dict[str, Any] = SAMPLE, samples: int = 4000) -> list[bytes]:

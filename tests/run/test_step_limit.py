@@ -50,7 +50,7 @@ def test_the_wine_bottle_is_marked_and_reported(replayed: tuple[Row, TrajectoryS
     row, store = replayed
     verdicts = verdicts_of(store.rows(), [row], FilterConfig())
     run = Outcome([row], store.rows(), {}, {row.episode_id: verdicts[row.trajectory_id]})
-    (told,) = manifest.build(run, {}, [], None, lambda row: ()).to_pylist()
+    (told,) = manifest.build(run, {}, [], None, lambda _: ()).to_pylist()
     assert (told["kept"], told["steps"], told["exceeds_step_limit"]) == (True, 347, True)
     (sentence,) = counts.beyond_step_limit([told])
     assert "347 of 300, in libero_goal/put_the_wine_bottle_on_the_rack" in sentence
