@@ -18,11 +18,10 @@ cloud store. Offline, any SentencePiece model is good enough here: store it in `
 
     HF_LEROBOT_HOME=.../lerobot_openpi uv run python .../read_v21.py openpi ROOT ASSETS [--data.extra-delta-transform]
 
-GR00T (N1.7, 23ace64) runs with Python 3.10, the imports of its loader, and in its checkout. Run it on the dataset as
-written. Then copy its ``examples/LIBERO/modality.json`` into ``meta``, as its page describes, and run it again:
+GR00T (N1.7, 626af89) runs in the environment of lerobot and starVLA, and in its checkout. Run it on a copy of the
+dataset as written. Then copy its ``examples/LIBERO/modality.json`` into ``meta``, as its page describes, and run it
+again:
 
-    uv pip install --python ENV torch==2.7.1 torchvision==0.22.1 torchcodec==0.4.0 numpy==1.26.4 pandas==2.2.3 \\
-        av==16.1.0 scipy==1.15.3 transformers==4.57.3 opencv-python-headless pyarrow pillow tqdm
     PYTHONPATH=. ENV/bin/python .../read_v21.py gr00t ROOT
 """
 

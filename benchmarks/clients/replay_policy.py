@@ -9,8 +9,8 @@ the controller:
 Then stock lerobot-eval runs either policy in the same episode, after the ``export`` lines of ``docs/evaluation.md``:
 
     export PYTHONPATH=.:benchmarks/clients
-    lerobot-eval --policy.discover_packages_path=replay_policy --policy.path=OUT/absolute --env.actions=absolute \
-        --env.discover_packages_path=pipeline.evaluation.lerobot_eval --env.type=perturbed_libero \
+    lerobot-eval --env.discover_packages_path=replay_policy --env.type=perturbed_libero \
+        --policy.path=OUT/absolute --env.actions=absolute \
         --env.task=libero_goal --env.tasks='[turn_on_the_stove]' --eval.n_episodes=1 --eval.batch_size=1
 """
 
@@ -25,6 +25,8 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.pretrained import PreTrainedPolicy
+
+import pipeline.evaluation.lerobot_eval  # noqa: F401  # registers the environments
 
 __path__: list[str] = []  # lerobot searches the imported package for modules
 
