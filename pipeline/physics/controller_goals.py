@@ -10,6 +10,12 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.scenes.compiled import ARM, CompiledScene, GripPose, grip_pose
 from pipeline.types import Floats, Scene, State
 
+FIRST_SIDE = np.array([1.0, 0.1, 0.01])
+"""Direction on whose side an episode's first axis-angle is; its entries differ, so that no usual axis is ambiguous."""
+
+SMALLEST_ANGLE = 1e-6
+"""Angle in rad below which a rotation has no certain axis."""
+
 
 def first_posture(scene: Scene, model: mujoco.MjModel) -> Floats:
     """Return the scene's state (S,) with the arm in the posture that the controller sees when it is restored.
@@ -27,7 +33,7 @@ def absolute_actions(actions: Floats, first_grip: GripPose, grips: Sequence[Grip
     """Return the actions (K, 7) as goals: position and axis-angle of the grip site in the world, and the gripper.
 
     The controller adds each delta to the pose of its step. It keeps its goal of the orientation through steps without
-    any turn.
+    any turn. The axis-angles have no jumps (``without_jumps``).
 
     Args:
         actions: (K, 7) executed actions.
@@ -36,14 +42,35 @@ def absolute_actions(actions: Floats, first_grip: GripPose, grips: Sequence[Grip
     """
     units = np.repeat([SCHEMA.action.unit_m, SCHEMA.action.unit_rad], 3)
     deltas = units * np.clip(actions[:, :6], *SCHEMA.action.range)
-    goals = []
+    positions_m, rotations = [], []
     rotation = Rotation.from_matrix(first_grip.rotation)
-    for grip, delta, action in zip(grips, deltas, actions, strict=True):
+    for grip, delta in zip(grips, deltas, strict=True):
         shift_m, turn = delta[:3], delta[3:]
         if turn.any():
             rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(grip.rotation)
-        goals.append(np.concatenate([grip.position_m + shift_m, rotation.as_rotvec(), action[6:]]))
-    return np.stack(goals)
+        positions_m.append(grip.position_m + shift_m)
+        rotations.append(rotation.as_rotvec())
+    return np.hstack([np.stack(positions_m), without_jumps(np.stack(rotations)), actions[:, 6:]])
+
+
+def without_jumps(axis_angles: Floats) -> Floats:
+    """Return axis-angles (K, 3) of the same rotations, of which each is the nearest to its predecessor.
+
+    An axis-angle with another multiple of 2 pi as its angle is the same rotation. LIBERO's hand points down, which is a
+    rotation by about pi, and SciPy's axis-angles change their sign there. The first axis-angle points to the side of
+    ``FIRST_SIDE``, so that all episodes begin with the same sign.
+    """
+    continuous: list[Floats] = []
+    former = np.pi * FIRST_SIDE
+    for axis_angle in axis_angles:
+        angle = np.linalg.norm(axis_angle)
+        if angle > SMALLEST_ANGLE:
+            axis = axis_angle / angle
+            turns = np.rint((former @ axis - angle) / (2 * np.pi))
+            axis_angle = axis_angle + 2 * np.pi * turns * axis
+        former = axis_angle
+        continuous.append(former)
+    return np.stack(continuous)
 
 
 def replayed_grips(scene: Scene, states: Iterable[Floats]) -> tuple[GripPose, list[GripPose]]:

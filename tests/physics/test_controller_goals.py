@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import PhysicsPerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
-from pipeline.physics.controller_goals import absolute_actions, replayed_grips
+from pipeline.physics.controller_goals import absolute_actions, replayed_grips, without_jumps
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
 from pipeline.seeding import rng
@@ -47,3 +47,23 @@ def test_goals_are_those_of_robosuites_controller(component: str) -> None:
     assert np.array_equal(goals[:, 6], actions[:, 6])
     held_rad = (Rotation.from_rotvec(goals[2, 3:6]).inv() * Rotation.from_rotvec(goals[0, 3:6])).magnitude()
     assert held_rad < 1e-9, "a goal stays through steps without a turn"
+
+
+def test_axis_angles_have_no_jumps_and_one_sign() -> None:
+    """A hand that points down, as in LIBERO, moves through the rotation by pi in both directions."""
+    generator, crossed = np.random.default_rng(0), 0
+    for _ in range(50):
+        down = Rotation.from_rotvec(np.pi * np.array([1.0, 1.0, 0.0]) / np.sqrt(2))
+        turns = np.cumsum(generator.normal(0, 0.05, (200, 3)), axis=0).clip(-0.6, 0.6)
+        rotations = Rotation.from_rotvec(turns) * down
+        shortest = rotations.as_rotvec()
+        continuous = without_jumps(shortest)
+        assert (Rotation.from_rotvec(continuous).inv() * rotations).magnitude().max() < 1e-9
+        assert np.linalg.norm(np.diff(continuous, axis=0), axis=1).max() < 1.0
+        assert continuous[0, 0] > 0
+        crossed += int(np.linalg.norm(np.diff(shortest, axis=0), axis=1).max() > 3.0)
+    assert crossed > 25, "otherwise this test tells little"
+
+
+def test_rotations_near_none_keep_their_axis_angle() -> None:
+    assert np.array_equal(without_jumps(np.zeros((3, 3))), np.zeros((3, 3)))
