@@ -1,6 +1,6 @@
 """Cost of a frame in each of LIBERO's five arenas, rendered by plain MuJoCo and with savings.
 
-    nice -n 10 python benchmarks/frame_cost.py [--frames 80]
+    nice -n 10 python benchmarks/frame_cost.py [--frames 80] [--view front_image ...] [--size-px 512]
 
 The script replays one demonstration of the starter set in each arena. It renders ``--frames`` of its frames with each
 camera in both ways, and a quarter of them with all lamps casting shadows. For each frame, the state is restored and the
@@ -26,7 +26,7 @@ import numpy as np
 from replayed_twin import replayed_twin
 
 from pipeline.config import RenderConfig, load
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import ALL_VIEWS, SCHEMA, SIZE_PX
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_code
 from pipeline.rendering.drawing import PlainDrawing
@@ -64,6 +64,8 @@ class Clock:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--frames", type=int, default=80, help="number of frames of each camera")
+    parser.add_argument("--view", choices=ALL_VIEWS, action="append", help="a view to render; by default the usual two")
+    parser.add_argument("--size-px", type=int, default=SIZE_PX, help="height and width of the frames")
     arguments = parser.parse_args()
     config, drawn = load(Path("configs/starter.yaml")), Clock("mjr_render", "mjr_readPixels")
     figures: dict[str, dict[str, dict[str, float]]] = {}
@@ -72,18 +74,26 @@ def main() -> None:
             trajectory = replayed_twin(config, task, Path(folder))
         figures[arena] = {}
         for shadows, frames in (("", arguments.frames), (" with shadows", arguments.frames // 4)):
-            for view, spec in SCHEMA.views.items():
-                figures[arena][view + shadows] = compared(trajectory, spec.camera, frames, bool(shadows), drawn)
+            for view in arguments.view or SCHEMA.views:
+                renderers = opened_both_ways(trajectory, arguments.size_px)
+                figures[arena][view + shadows] = compared(
+                    trajectory, renderers, ALL_VIEWS[view].camera, frames, bool(shadows), drawn
+                )
         print(arena, figures[arena], flush=True)
-    print(json.dumps({"frames": arguments.frames, "arenas": figures}))
+    print(json.dumps({"frames": arguments.frames, "size_px": arguments.size_px, "arenas": figures}))
 
 
-def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool, drawn: Clock) -> dict[str, float]:
-    ours = Renderer(trajectory.model_xml)
-    ours.model.light_castshadow[:] |= shadows
+def opened_both_ways(trajectory: Trajectory, size_px: int) -> dict[str, Renderer]:
+    ours = Renderer(trajectory.model_xml, size_px=size_px)
+    return {"plain": Renderer(ours.model, PlainDrawing(ours.model, size_px)), "ours": ours}
+
+
+def compared(
+    trajectory: Trajectory, renderers: dict[str, Renderer], camera: str, frames: int, shadows: bool, drawn: Clock
+) -> dict[str, float]:
+    renderers["ours"].model.light_castshadow[:] |= shadows
     steps = range(min(frames, len(trajectory.actions)))
-    with closing(ours), closing(Renderer(ours.model, PlainDrawing(ours.model))) as plain:
-        renderers = {"plain": plain, "ours": ours}
+    with closing(renderers["ours"]), closing(renderers["plain"]):
         spent_s, beside_s = dict.fromkeys(renderers, 0.0), dict.fromkeys(renderers, 0.0)
         same = 0
         for step in steps:
