@@ -19,18 +19,11 @@ from pipeline.evaluation.start_frames import LastStartFrames
 CASES = {case.name: case for case in frame_causes.cases()}
 
 CHOSEN = (
-    "object: MuJoCo 3.1.6",
     "object: MuJoCo 3.3.3",
     "object: MuJoCo 3.8.1, rotated 180, 224",
     "object: mirrored",
-    "object: transposed",
-    "object: red and blue exchanged",
     "object: rendered with 360 pixels",
-    "object: middle 90 %",
-    "object: 0.8 times as bright",
-    "object: wrist, MuJoCo 3.8.1",
     "goal: MuJoCo 3.3.3",
-    "goal: JPEG 50",
     "goal: steps0, rotated 180",
     "goal: gripper1",
     "goal: seed7",
