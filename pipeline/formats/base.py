@@ -186,6 +186,11 @@ class Format(ABC, Generic[Options]):
         return False
 
     @property
+    def depth_as_video(self) -> bool:
+        """Return whether depth is a video in lerobot's own codes."""
+        return False
+
+    @property
     def record_file(self) -> Path:
         return self.data / f"{self.name}.json"
 
