@@ -147,7 +147,7 @@ class Format(ABC, Generic[Options]):
     """End of the card's sentence on the episodes for validation, in Markdown."""
     splits_each_suite: ClassVar[bool] = False
     """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
-    step_s: ClassVar[float]
+    step_s: float
     """CPU time of one core to write one step of an episode, in s, on the reference machine of ``work_time.py``."""
     columns: ClassVar[tuple[pa.Field, ...]]
     """Columns of the manifest with the place of an episode; null when it was dropped."""

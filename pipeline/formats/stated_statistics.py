@@ -83,9 +83,7 @@ def wrong_sample(column: str, stored: Stored, levels: NDArray[np.int64], steps: 
     yield from disordered(column, stored)
 
 
-def wrong_depth(
-    column: str, stored: Stored, maps_m: NDArray[Any], steps: int, quantiles: Sequence[str]
-) -> Wrong:
+def wrong_depth(column: str, stored: Stored, maps_m: NDArray[Any], steps: int, quantiles: Sequence[str]) -> Wrong:
     """Compare an episode's statistics of depth with its maps (T, H, W) in m.
 
     If these are fewer than its steps, the range must contain them, and nothing else is compared.

@@ -24,6 +24,12 @@ EPISODES_OF_A_PIECE = 50
 """Largest number of episodes that are written again after a call was killed; the files do not depend on it."""
 
 
+DEPTH_MAP_S = 0.010
+"""CPU time of one core to encode a depth map of 256 x 256 as video, in s."""
+
+DEPTH_MAP_KB = 17.0
+"""Size of a depth map of 256 x 256 in a video of the agent view, in KB; one of the wrist view has half of it."""
+
 MAPS_STORED_AS = "PNG as base64 text"
 
 
@@ -108,7 +114,7 @@ class LeRobot(Format[LeRobotConfig]):
     maps_stored_as: ClassVar = MAPS_STORED_AS
     flattens_matrices: ClassVar = True
     group: ClassVar = "lerobot"
-    step_s: ClassVar = 0.0015
+    step_s = 0.0015
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
@@ -117,6 +123,7 @@ class LeRobot(Format[LeRobotConfig]):
     def __init__(self, data: Path, options: LeRobotConfig, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
         self.keys = _keys(self._convention, content)
+        self.step_s += DEPTH_MAP_S * content.area * len(self._convention.depth_videos(content))
 
     @property
     def language(self) -> bool:
@@ -164,6 +171,8 @@ class LeRobot(Format[LeRobotConfig]):
         images_kb = 40.0 if self.options.frames == "images" else 0.0
         data_kb = 0.5 + views * (maps_kb + images_kb)
         video_kb = 6.0 * views
+        if self.depth_as_video:
+            video_kb = max(video_kb, DEPTH_MAP_KB * self.content.area)
         return int(1000 * FILE_MB / max(data_kb, video_kb))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
@@ -280,7 +289,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     maps_stored_as: ClassVar = MAPS_STORED_AS
     flattens_matrices: ClassVar = True
     group: ClassVar = LeRobot.group
-    step_s: ClassVar = LeRobot.step_s
+    step_s = LeRobot.step_s
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
 

@@ -260,9 +260,7 @@ def _object_poses(table: pa.Table) -> NDArray[np.float32]:
     return matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
 
 
-def _geometry(
-    table: pa.Table, row: Mapping[str, Any], view: str, content: Content, convention: Convention
-) -> Geometry:
+def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, content: Content, convention: Convention) -> Geometry:
     matrices = {}
     for name in MATRICES:
         numbers = np.array(row[camera_column(view, name)], np.float32)

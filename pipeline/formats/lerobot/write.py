@@ -261,9 +261,7 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, conven
     }
 
 
-def _step_columns(
-    episode: Episode, found: Numbers, convention: Convention, content: Content
-) -> dict[str, pa.Array]:
+def _step_columns(episode: Episode, found: Numbers, convention: Convention, content: Content) -> dict[str, pa.Array]:
     """Return the columns of an episode's steps, with its images if they are stored as such."""
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, geometry in episode.geometry.items():
