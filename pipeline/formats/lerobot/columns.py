@@ -210,6 +210,7 @@ class Convention:
         views = len(content.views)
         video_kb = VIEW_AS_VIDEO_KB * views * content.area
         frames_kb = video_kb if self.frames == "video" else views * sizes.frame_kb + sizes.motion_kb
+        # Depth as video counts as text here, of which it takes a third.
         return frames_kb + IN_TEXT * views * sizes.maps_kb + sizes.poses_kb
 
     def columns(self, content: Content) -> dict[str, dict[str, Any]]:

@@ -30,7 +30,7 @@ DEPTHS = np.iinfo(SCHEMA.depth.dtype).max + 1
 ENCODER: Final = "hevc"
 PIXEL_FORMAT: Final = "gray12le"
 ENCODER_OPTIONS = {
-    # On LIBERO maps, 17 and 9 kB a map in agent and wrist view; "superfast" saves 40 % of the bytes for twice the time.
+    # On LIBERO maps, 16 and 9 kB a map in agent and wrist view; "superfast" saves 40 % of the bytes for twice the time.
     "preset": "ultrafast",
     # lerobot's own choice, as for frames: any map is at most one map away from a key frame.
     "g": "2",
