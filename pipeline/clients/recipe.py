@@ -117,7 +117,7 @@ def _training_and_clients(
 def _inputs_without_depth(export: ExportConfig, content: Content) -> str:
     """Return the option of lerobot-train that leaves depth videos out of a policy's inputs; empty without such videos.
 
-    By default, lerobot passes all videos to a policy, whose image encoder requires three channels.
+    Otherwise lerobot passes all videos to a policy, whose image encoder requires three channels.
     """
     lerobot = export.options_for(LeRobot)
     if lerobot is None or lerobot.depth == "text":

@@ -94,7 +94,7 @@ def of_levels(counts: Counts, frames: int, levels_per_unit: int = 255) -> dict[s
     """Compute lerobot's statistics of a camera, each (channels, 1, 1), from the levels of a number of frames.
 
     ``count`` is (1,), in frames. A quantile is the least level at which the cumulative share of pixels reaches it.
-    By default the statistics are in [0, 1].
+    With the default of ``levels_per_unit`` the statistics are in [0, 1].
     """
     pixels, levels = counts.sum(axis=1), np.arange(float(counts.shape[1]))
     mean = counts @ levels / pixels
