@@ -62,6 +62,13 @@ class FormatOptions(Frozen):
             ValueError: naming the client.
         """
 
+    def refuse_content(self, content: Content) -> None:
+        """Reject options that do not fit the content of the run's episodes.
+
+        Raises:
+            ValueError: naming the option.
+        """
+
 
 Options = TypeVar("Options", bound=FormatOptions)
 

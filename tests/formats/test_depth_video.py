@@ -44,12 +44,13 @@ def with_maps(episode_id: str) -> Episode:
 def depth_m(episode: Episode, view: str) -> NDArray[np.float64]:
     """Decode the stored depth of all steps, (T, H, W) in m."""
     packed = episode.geometry[view].maps["depth"]
-    return np.stack([cv2.imdecode(np.frombuffer(each, np.uint8), -1) for each in packed]) / 10_000
+    maps = [np.asarray(cv2.imdecode(np.frombuffer(each, np.uint8), -1), np.float64) for each in packed]
+    return np.stack(maps) / 10_000
 
 
 def half_a_code_m(distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the largest error of 4095 logarithmic steps from 0.01 to 10 m, which are shifted by 3.5 m."""
-    return (distance_m + 3.5) * np.expm1(0.5 / 4095 * np.log(13.5 / 3.51)) + 1e-6
+    return np.asarray((distance_m + 3.5) * np.expm1(0.5 / 4095 * np.log(13.5 / 3.51)) + 1e-6)
 
 
 def write(out: Path, frames: str = "video") -> LeRobot:
@@ -166,7 +167,7 @@ def test_other_depth_is_found(dataset: LeRobot) -> None:
     found = findings("depth", made, replace(copy, depth_m={**copy.depth_m, place: other_m}))
     assert [text.split(" differs")[0] for text in found] == ["image_depth of step 0"]
     exchanged = {place: copy.depth_m["wrist_image", 0]}
-    assert findings("depth", made, replace(copy, depth_m=copy.depth_m | exchanged))
+    assert findings("depth", made, replace(copy, depth_m={**copy.depth_m, **exchanged}))
 
 
 def halve(figures: dict[str, Any]) -> None:
@@ -235,7 +236,9 @@ else:
         with pytest.raises(PipelineError, match=r"export\.lerobot\.depth: video requires depth in render\.extras"):
             load(file)
         file.write_text(CONFIG.format("depth"))
-        assert load(file).export.lerobot.depth == "video"
+        options = load(file).export.options_for(LeRobot)
+        assert options is not None
+        assert options.depth == "video"
 
     def test_the_codes_are_lerobots() -> None:
         from lerobot.datasets.depth_utils import dequantize_depth, quantize_depth

@@ -75,6 +75,10 @@ class LeRobotConfig(FormatOptions):
             _require_lerobot_06("depth as video")
         return depth
 
+    def refuse_content(self, content: Content) -> None:
+        if self.depth == "video" and "depth" not in content.extras:
+            raise ValueError("export.lerobot.depth: video requires depth in render.extras, which does not list it")
+
 
 def _require_lerobot_06(content: str) -> None:
     """Reject an option whose content lerobot reads from 0.6 on, where an older version is installed.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import ALL_VIEWS, MATRICES, MOTION, SCHEMA, Content, MatrixSpec, PosesSpec
 from pipeline.formats.base import StepSizes
 from pipeline.formats.lerobot import depth
+from pipeline.types import Extra
 
 Frames = Literal["video", "images"]
 """``video`` is H.264 encoded from the stored frames; ``images`` are the stored JPEG files, three times as large."""
@@ -183,7 +184,7 @@ class Convention:
             return f"{ALL_VIEWS[view].lerobot_key}_depth"
         return camera_column(view, name)
 
-    def text_maps(self, content: Content) -> list[str]:
+    def text_maps(self, content: Content) -> list[Extra]:
         """List the maps that are stored as text."""
         return [name for name in content.maps if name != "depth" or self.depth == "text"]
 

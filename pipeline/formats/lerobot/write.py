@@ -107,7 +107,7 @@ class Video:
 
     encoder: ClassVar[str] = ENCODER
     encoder_options: ClassVar[dict[str, str]] = ENCODER_OPTIONS
-    pixel_format: ClassVar[str] = VIDEO_INFO["video.pix_fmt"]
+    pixel_format: ClassVar[str] = str(VIDEO_INFO["video.pix_fmt"])
 
     def __init__(self, path: Path, content: Content = STANDARD) -> None:
         self.frames = 0
