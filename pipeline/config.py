@@ -339,6 +339,8 @@ class Config(Frozen):
                     f"plan.axes.language: {len(without)} tasks have no rewrites, such as {without[0]}; leave language "
                     "out, exclude the tasks from demos.tasks, or name a bank that the command rewrite has written"
                 )
+        for options in self.export.formats.values():
+            options.refuse_content(self.render.content)
         components = {CLEAN}
         for axis in axes.configured():
             components.update(components_of(axis))

@@ -271,8 +271,9 @@ def write_recipe(run: Run) -> None:
     """Write the fine-tuning recipe, and the files that each policy's code needs to train on the datasets."""
     from pipeline.clients import recipe
 
-    export = run.config.export
-    built = recipe.build(run.manifest_file, run.manifest, export, run.config.finetune.rewrite_probability)
+    export, content = run.config.export, run.config.render.content
+    probability = run.config.finetune.rewrite_probability
+    built = recipe.build(run.manifest_file, run.manifest, export, probability, content)
     recipe.write(built, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
     file = run.path(FINETUNE) / RECIPE
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")

@@ -13,7 +13,7 @@ import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.clients.files import LEROBOT_TRAIN, OFT_SCRIPT, OPENPI_ASSETS, RECIPE, ROBOMIMIC_CONFIG, STARVLA_CONFIG
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, STANDARD, Content
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
@@ -50,7 +50,11 @@ def sourced(value: Any, source: str) -> dict[str, Any]:
 
 
 def build(
-    manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: ExportConfig, rewrite_probability: float = 0.0
+    manifest_file: Path,
+    rows: Sequence[Mapping[str, Any]],
+    export: ExportConfig,
+    rewrite_probability: float = 0.0,
+    content: Content = STANDARD,
 ) -> dict[str, Any]:
     """Return the fine-tuning recipe of a run.
 
@@ -59,6 +63,7 @@ def build(
             every episode, its place in each format, and the versions and the device that generated it.
         export: the datasets that the run exports; its RLDS name is OpenVLA-OFT's name for all RLDS datasets.
         rewrite_probability: ``finetune.rewrite_probability``.
+        content: the content of the episodes.
     """
     rlds, lerobot = export.options_for(Rlds), export.options_for(LeRobot)
     kept = [row for row in rows if row["kept"]]
@@ -85,11 +90,13 @@ def build(
         oft_validates = bool(validating) and validating == {*suites.values()}
     if lerobot is not None:
         dataset["lerobot"] = sourced(lerobot.name, "the run's configuration, export.lerobot.name")
-    sections = _training_and_clients(export, oft_validates, rewrite_probability)
+    sections = _training_and_clients(export, oft_validates, rewrite_probability, content)
     return {"name": (rlds or export).name, "dataset": dataset, **sections}
 
 
-def _training_and_clients(export: ExportConfig, oft_validates: bool, rewrite_probability: float) -> dict[str, Any]:
+def _training_and_clients(
+    export: ExportConfig, oft_validates: bool, rewrite_probability: float, content: Content
+) -> dict[str, Any]:
     """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``.
 
     Clients whose format is not exported are listed with the setting that exports it.
@@ -99,11 +106,27 @@ def _training_and_clients(export: ExportConfig, oft_validates: bool, rewrite_pro
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
     values |= {"rewrite_probability": rewrite_probability}
+    values |= {"inputs": _inputs_without_depth(export, content)}
     values |= {"robomimic_config": ROBOMIMIC_CONFIG}
     values |= {"ipec_set": _v21_of(export, "ipec"), "openpi_set": _v21_of(export, "openpi")}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
     missing = {client: setting for client, setting in EXPORTS.items() if client not in sections["clients"]}
     return {**sections, "clients_of_other_formats": missing} if missing else sections
+
+
+def _inputs_without_depth(export: ExportConfig, content: Content) -> str:
+    """Return the option of lerobot-train that leaves depth videos out of a policy's inputs; empty without such videos.
+
+    Otherwise lerobot passes all videos to a policy, whose image encoder requires three channels.
+    """
+    lerobot = export.options_for(LeRobot)
+    if lerobot is None or lerobot.depth == "text":
+        return ""
+    height, width, channels = content.frame_shape
+    features: dict[str, Any] = {SCHEMA.state.lerobot_key: {"type": "STATE", "shape": list(SCHEMA.state.shape)}}
+    for view in content.cameras.values():
+        features[view.lerobot_key] = {"type": "VISUAL", "shape": [channels, height, width]}
+    return f" --policy.input_features='{json.dumps(features)}'"
 
 
 def _v21_of(export: ExportConfig, convention: str) -> tuple[str, str] | None:

@@ -62,6 +62,13 @@ class FormatOptions(Frozen):
             ValueError: naming the client.
         """
 
+    def refuse_content(self, content: Content) -> None:
+        """Reject options that do not fit the content of the run's episodes.
+
+        Raises:
+            ValueError: naming the option.
+        """
+
 
 Options = TypeVar("Options", bound=FormatOptions)
 
@@ -147,7 +154,7 @@ class Format(ABC, Generic[Options]):
     """End of the card's sentence on the episodes for validation, in Markdown."""
     splits_each_suite: ClassVar[bool] = False
     """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
-    step_s: ClassVar[float]
+    step_s: float
     """CPU time of one core to write one step of an episode, in s, on the reference machine of ``work_time.py``."""
     columns: ClassVar[tuple[pa.Field, ...]]
     """Columns of the manifest with the place of an episode; null when it was dropped."""
@@ -183,6 +190,11 @@ class Format(ABC, Generic[Options]):
     @property
     def language(self) -> bool:
         """Return whether every frame has lerobot's language column."""
+        return False
+
+    @property
+    def depth_as_video(self) -> bool:
+        """Return whether depth is a video in lerobot's own codes."""
         return False
 
     @property

@@ -81,9 +81,7 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 """Quantiles under lerobot's names."""
 
 Counts = NDArray[np.int64]
-"""(3, 256) number of pixels with each level in each channel; counts of several frames add up."""
-
-_LEVELS = np.arange(256.0)
+"""(channels, levels) number of pixels with each level in each channel; counts of several frames add up."""
 
 
 def count(frame: Frame) -> Counts:
@@ -92,20 +90,21 @@ def count(frame: Frame) -> Counts:
     return np.stack(channels).astype(np.int64)
 
 
-def of_levels(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
-    """Compute lerobot's statistics of a camera, each (3, 1, 1) in [0, 1], from the levels of a number of frames.
+def of_levels(counts: Counts, frames: int, levels_per_unit: int = 255) -> dict[str, NDArray[Any]]:
+    """Compute lerobot's statistics of a camera, each (channels, 1, 1), from the levels of a number of frames.
 
     ``count`` is (1,), in frames. A quantile is the least level at which the cumulative share of pixels reaches it.
+    With the default of ``levels_per_unit`` the statistics are in [0, 1].
     """
-    pixels = counts.sum(axis=1)
-    mean = counts @ _LEVELS / pixels
+    pixels, levels = counts.sum(axis=1), np.arange(float(counts.shape[1]))
+    mean = counts @ levels / pixels
     shares = counts.cumsum(axis=1) / pixels[:, None]
     figures: dict[str, NDArray[Any]] = {
         "min": (counts > 0).argmax(axis=1),
         "max": (shares == 1).argmax(axis=1),
         "mean": mean,
-        "std": np.sqrt((counts * (_LEVELS - mean[:, None]) ** 2).sum(axis=1) / pixels),
+        "std": np.sqrt((counts * (levels - mean[:, None]) ** 2).sum(axis=1) / pixels),
         **{name: (shares >= q).argmax(axis=1) for name, q in QUANTILES.items()},
     }
-    scaled = {name: levels.reshape(3, 1, 1) / 255 for name, levels in figures.items()}
+    scaled = {name: figure.reshape(-1, 1, 1) / levels_per_unit for name, figure in figures.items()}
     return {**scaled, "count": np.array([frames])}

@@ -1,10 +1,11 @@
 """Records of a dataset that is read back: its copies of episodes, its files, and the faults of both."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import MAKE_AGAIN
@@ -38,6 +39,7 @@ class Statistics:
         stored: column to the name of a statistic to its values.
         numbers: column to its values at each step, (T, D).
         views: view to the column of its frames.
+        depth: view to the column of its depth, if that is a video.
         quantiles: names of the quantiles that the dataset states of an episode.
     """
 
@@ -45,6 +47,7 @@ class Statistics:
     numbers: Mapping[str, NDArray[Any]]
     views: Mapping[str, str]
     quantiles: Sequence[str] = ()
+    depth: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class Copy:
         train: True if the episode is in the training split.
         statistics: statistics of the episode; ``None`` where the dataset states none.
         lossless: True if the frames in ``decoded`` were stored without loss.
+        depth_m: (view, step) to the depth (H, W) in m, for ``sampled`` steps, where depth is a video.
     """
 
     dataset: str
@@ -75,6 +79,7 @@ class Copy:
     train: bool = True
     statistics: Statistics | None = None
     lossless: bool = False
+    depth_m: Mapping[tuple[str, int], NDArray[np.float32]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.episode)

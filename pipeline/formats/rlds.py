@@ -55,7 +55,7 @@ class Rlds(Format[RldsConfig]):
     splits_each_suite: ClassVar = True  # OpenVLA-OFT, when it validates, reads the split val of each set.
     held_out_place: ClassVar = "are the split `val` of each set."
     group: ClassVar = "rlds"
-    step_s: ClassVar = 0.0004
+    step_s = 0.0004
     columns: ClassVar = (
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
         column("rlds_index", pa.int64(), "place in the shard, null when dropped"),

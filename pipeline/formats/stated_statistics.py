@@ -83,6 +83,26 @@ def wrong_sample(column: str, stored: Stored, levels: NDArray[np.int64], steps: 
     yield from disordered(column, stored)
 
 
+def wrong_depth(column: str, stored: Stored, maps_m: NDArray[Any], steps: int, quantiles: Sequence[str]) -> Wrong:
+    """Compare an episode's statistics of depth with its maps (T, H, W) in m.
+
+    If these are fewer than its steps, the range must contain them, and nothing else is compared.
+    """
+    if np.ravel(stored["count"]).tolist() != [steps]:
+        yield f"count of {column} is {np.ravel(stored['count']).tolist()} in the statistics", f"[{steps}]"
+    least, largest = (float(np.ravel(stored[name])[0]) for name in ("min", "max"))
+    if least > maps_m.min() + SAME or largest < maps_m.max() - SAME:
+        statement = f"the range of {column} is {least:g} to {largest:g} m in the statistics"
+        yield statement, f"{maps_m.min():g} to {maps_m.max():g} m or more"
+    yield from disordered(column, stored)
+    if len(maps_m) == steps:
+        wanted = {name: getattr(maps_m, name)() for name in ("mean", "std", "min", "max")}
+        shares = [int(name[1:]) / 100 for name in quantiles]
+        wanted |= dict(zip(quantiles, np.quantile(maps_m, shares, method="inverted_cdf"), strict=True))
+        for name, expected in wanted.items():
+            yield from unlike_figures(f"{name} of {column}", np.ravel(stored[name]), np.array([expected]))
+
+
 def _of_levels(levels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Compute mean, deviation and range in [0, 1] of pixels from the counts of their levels, (3, 256)."""
     values, pixels = np.arange(256) / 255, levels.sum(axis=1)

@@ -54,3 +54,15 @@ def decode(packed: bytes) -> Frame:
     if frame is None:
         raise ValueError("not an image that OpenCV can decode")
     return np.asarray(frame, np.uint8)
+
+
+def decode_exactly(packed: bytes) -> NDArray[Any]:
+    """Decode a PNG file of ``encode_exactly`` to its pixels (H, W).
+
+    Raises:
+        ValueError: if OpenCV cannot decode the bytes.
+    """
+    pixels = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError("not an image that OpenCV can decode")
+    return np.asarray(pixels)

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MOTION
+from pipeline.episode_schema import MOTION, SCHEMA
 from pipeline.formats.read_back import Copy, Fault, sampled
-from pipeline.images.jpeg import decode
+from pipeline.images.jpeg import decode, decode_exactly
 from pipeline.types import Episode, Frame, Trajectory
 
 
@@ -79,6 +79,21 @@ class Case:
             frames = {step: decode(files[step]) for step in steps}
             views[view] = Seen("frames", view, frames)
         return views
+
+    @cached_property
+    def sampled_depth_m(self) -> dict[tuple[str, int], NDArray[np.float64]]:
+        """Stored depth (H, W) in m of the sampled steps, by view and step; empty where no depth is stored."""
+        depth_m = {}
+        for view, geometry in self.made.geometry.items():
+            files = geometry.maps.get("depth", ())
+            for step in sampled(len(files)) if files else ():
+                depth_m[view, step] = decode_exactly(files[step]) * SCHEMA.depth.unit_m
+        return depth_m
+
+    def depth_m(self, view: str) -> NDArray[np.float64]:
+        """Return the stored depth of all steps of a view in m, (T, H, W)."""
+        files = self.made.geometry[view].maps["depth"]
+        return np.stack([decode_exactly(file) for file in files]) * SCHEMA.depth.unit_m
 
     @cached_property
     def seen(self) -> list[Seen]:

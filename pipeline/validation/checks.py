@@ -13,7 +13,7 @@ from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.catalogue.scene_files import portable
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, label_faults, labels_of
 from pipeline.formats.read_back import Copy, Fault, sampled
-from pipeline.formats.stated_statistics import FIGURES, complete, wrong_numbers, wrong_pixels, wrong_sample
+from pipeline.formats.stated_statistics import FIGURES, complete, wrong_depth, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.libero import bddl
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
 from pipeline.run.manifest import OWN_VERSION
@@ -243,6 +243,8 @@ def geometry(case: Case) -> Iterator[Fault]:
                 if matrix.dtype != expected.dtype or not np.array_equal(matrix, expected):
                     yield case.finding(copy.dataset, f"{view}_{name} is {matrix.tolist()}", expected.tolist())
             for name, files in made.maps.items():
+                if name == "depth" and copy.depth_m:
+                    continue  # ``depth`` compares videos.
                 if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
             if not _same(copy.episode.geometry[view].boxes, made.boxes):
@@ -251,6 +253,29 @@ def geometry(case: Case) -> Iterator[Fault]:
             yield case.finding(copy.dataset, "object_poses differ", "the stored poses")
         if list(copy.episode.instances) != list(case.made.instances):
             yield case.finding(copy.dataset, f"instances {list(copy.episode.instances)}", list(case.made.instances))
+
+
+DEPTH_SHARE, DEPTH_OFFSET_M = 1.65e-4, 3.5
+"""Largest error of lerobot's depth, as a share of the distance plus 3.5 m: half of 4095 codes, which span a factor of
+13.5 / 3.51."""
+
+NEAREST_DEPTH_M = 0.01
+"""Least distance that lerobot's codes state."""
+
+
+def depth(case: Case) -> Iterator[Fault]:
+    """Check that depth in videos is within half a code of the stored depth."""
+    for copy in case.whole:
+        for (view, step), depth_m in copy.depth_m.items():
+            expected_m = np.maximum(case.sampled_depth_m[view, step], NEAREST_DEPTH_M)
+            if depth_m.shape != expected_m.shape:
+                yield case.finding(copy.dataset, f"{view}_depth is {depth_m.shape}", expected_m.shape)
+                continue
+            errors_m = np.abs(depth_m - expected_m)
+            wrong = errors_m > DEPTH_SHARE * (expected_m + DEPTH_OFFSET_M)
+            if wrong.any():
+                what = f"{view}_depth of step {step} differs by up to {1000 * errors_m.max():.1f} mm"
+                yield case.finding(copy.dataset, what, "the stored depth, within half a code")
 
 
 def boxes(case: Case) -> Iterator[Fault]:
@@ -372,7 +397,7 @@ def statistics(case: Case) -> Iterator[Fault]:
             continue
         stored, quantiles = statistics.stored, statistics.quantiles
         wrong: list[tuple[str, str]] = []
-        if stored.keys() != statistics.numbers.keys() | {*statistics.views.values()}:
+        if stored.keys() != statistics.numbers.keys() | {*statistics.views.values(), *statistics.depth.values()}:
             wrong.append((f"states the columns {sorted(stored)}", f"{sorted(statistics.numbers)} and the views"))
         figures = (*FIGURES, *quantiles)
         for column, values in statistics.numbers.items():
@@ -388,6 +413,12 @@ def statistics(case: Case) -> Iterator[Fault]:
             wrong += wrong_sample(column, stated, case.sampled_levels[view], len(case.made))
             if case.witness:
                 wrong += wrong_pixels(column, stated, case.levels[view], quantiles)
+        for view, column in statistics.depth.items():
+            stated = stored.get(column, {})
+            lacking = [*complete(column, stated, figures, 1)]
+            sample_m = [map_m for (name, _), map_m in case.sampled_depth_m.items() if name == view]
+            maps_m = case.depth_m(view) if case.witness else np.stack(sample_m)
+            wrong += lacking or wrong_depth(column, stated, maps_m, len(case.made), quantiles)
         for what, expected in wrong:
             yield case.finding(copy.dataset, what, expected)
 
@@ -414,7 +445,7 @@ def _listed(place: Mapping[str, Any]) -> str:
 Check = Callable[[Case], Iterable[Fault]]
 
 _LABELS = (length, motion, instruction, labels, wording, provenance, place)
-_PICTURES = (jpeg, geometry, boxes, video, cameras, alive)
+_PICTURES = (jpeg, geometry, depth, boxes, video, cameras, alive)
 _EVERY = (*_LABELS, *_PICTURES, gripper, flags, clock, statistics)
 CHECKS: Mapping[str, Check] = {check.__name__: check for check in _EVERY}
 """Name to check."""

@@ -18,6 +18,7 @@ from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from synthetic import IDS, NAME, episode, write_lerobot
 
 from pipeline.clients import recipe
+from pipeline.episode_schema import Content
 from pipeline.export_config import ExportConfig
 from pipeline.formats.lerobot import LeRobotConfig
 
@@ -85,6 +86,27 @@ def test_act_trains_by_the_recipes_command_without_a_network(root: Path, tmp_pat
     arguments = ["--output_dir", str(tmp_path / "trained"), "--policy.device=cpu"]
     subprocess.run([trainer, *words, *arguments], env=environment, check=True, timeout=600)
     assert [*(tmp_path / "trained").rglob("model.safetensors")]
+
+
+def test_the_recipes_leave_depth_videos_out_of_the_inputs(tmp_path: Path) -> None:
+    """As lerobot-train reads the option; by default it passes all videos to a policy."""
+    manifest = tmp_path / "manifest"
+    manifest.touch()
+    # As it is written by lerobot 0.6, where the field is not rejected.
+    lerobot = LeRobotConfig(name=NAME).model_copy(update={"depth": "video"})
+    export = ExportConfig().model_copy(update={"lerobot": lerobot})
+    content = Content(size_px=128, extras=("depth",))
+    clients = recipe.build(manifest, [], export, content=content)["clients"]
+    for client in ("lerobot_act", "lerobot_pi05"):
+        words = shlex.split(clients[client]["command"])[1:]
+        options: Any = draccus.argparsing.parse(TrainPipelineConfig, args=words)
+        shapes = {name: tuple(feature.shape) for name, feature in options.policy.input_features.items()}
+        assert shapes == {
+            "observation.state": (8,),
+            "observation.images.image": (3, 128, 128),
+            "observation.images.image2": (3, 128, 128),
+        }
+        assert [*options.policy.image_features] == ["observation.images.image", "observation.images.image2"]
 
 
 def test_takes_the_words_of_the_recipe(tmp_path: Path) -> None:

@@ -170,6 +170,19 @@ def test_what_is_beside_the_frames_is_described_where_it_is_there(data: Path, ki
     assert "`instances`" not in written(data, kind, extras=("depth",))
 
 
+def test_depth_as_video_and_its_readers_are_named(data: Path) -> None:
+    # As it is written by lerobot 0.6, where the field is not rejected.
+    lerobot = LeRobotConfig(name=NAME).model_copy(update={"depth": "video"})
+    config = ExportConfig.model_validate({"rlds": None}).model_copy(update={"lerobot": lerobot})
+    text = written(data, "lerobot", config, extras=("depth", "segmentation"))
+    assert "`observation.images.image_depth`" in text
+    assert "`camera.agent.depth`" not in text
+    assert "before 0.6 cannot read depth" in text
+    assert "a unit is 0.0001 m" not in text
+    assert "`camera.agent.segmentation`" in text
+    assert "0.6" not in written(data, "lerobot", extras=("depth",))
+
+
 def test_a_language_column_and_who_can_open_it_are_named(data: Path) -> None:
     # As it is written by lerobot 0.6, where the field is not refused.
     lerobot = LeRobotConfig(name=NAME).model_copy(update={"language": True})

@@ -39,7 +39,7 @@ class Hdf5(Format[Hdf5Config]):
     recipe: ClassVar = 1
     packages: ClassVar = ("h5py", "numpy", "opencv-python-headless")
     group: ClassVar = "hdf5"
-    step_s: ClassVar = 0.012
+    step_s = 0.012
     # The attribute ``episode_id`` of each demonstration joins it with the manifest, which needs no columns.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
     stores_replay: ClassVar = True

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
 from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
-from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Action, Convention, camera_column
+from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Action, Convention, Depth
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
 from pipeline.tables import column
@@ -23,6 +23,12 @@ from pipeline.types import Count
 EPISODES_OF_A_PIECE = 50
 """Largest number of episodes that are written again after a call was killed; the files do not depend on it."""
 
+
+DEPTH_MAP_S = 0.010
+"""CPU time of one core to encode a depth map of 256 x 256 as video, in s."""
+
+DEPTH_MAP_KB = 17.0
+"""Size of a depth map of 256 x 256 in a video of the agent view, in KB; one of the wrist view has half of it."""
 
 MAPS_STORED_AS = "PNG as base64 text"
 
@@ -41,6 +47,8 @@ class LeRobotConfig(FormatOptions):
             ``absolute``, its goal; ``delta`` by default. The other one is in ``absolute_action`` or ``delta_action``.
         language: True adds the task's rewrites and the current subtask to every frame, in lerobot's language column;
             false by default. Versions of lerobot before 0.6 cannot read such a dataset.
+        depth: Storage of the extra ``depth``: ``text`` is its PNG files in base64, ``video`` is lerobot's own depth in
+            codes of 12 bits; ``text`` by default. Versions of lerobot before 0.6 cannot read ``video``.
     """
 
     name: Name = ""
@@ -51,26 +59,46 @@ class LeRobotConfig(FormatOptions):
     # Excluded at their defaults, as ``lerobot_v21``.
     action: Action = Field(default="delta", exclude_if=lambda action: action == "delta")
     language: bool = Field(default=False, exclude_if=lambda language: not language)
+    depth: Depth = Field(default="text", exclude_if=lambda depth: depth == "text")
 
     @field_validator("language")
     @classmethod
-    def _readable(cls, language: bool) -> bool:
-        if not language:
-            return language
-        installed = version("lerobot")
-        if Version(installed) < Version("0.6"):
-            raise ValueError(
-                f"lerobot {installed}, which checks the set here, cannot read language columns; expected 0.6 or later, "
-                "which the installation on Python 3.12 or later has"
-            )
+    def _readable_language(cls, language: bool) -> bool:
+        if language:
+            _require_lerobot_06("language columns")
         return language
+
+    @field_validator("depth")
+    @classmethod
+    def _readable_depth(cls, depth: Depth) -> Depth:
+        if depth == "video":
+            _require_lerobot_06("depth as video")
+        return depth
+
+    def refuse_content(self, content: Content) -> None:
+        if self.depth == "video" and "depth" not in content.extras:
+            raise ValueError("export.lerobot.depth: video requires depth in render.extras, which does not list it")
+
+
+def _require_lerobot_06(content: str) -> None:
+    """Reject an option whose content lerobot reads from 0.6 on, where an older version is installed.
+
+    Raises:
+        ValueError: naming the content and the installed version.
+    """
+    installed = version("lerobot")
+    if Version(installed) < Version("0.6"):
+        raise ValueError(
+            f"lerobot {installed}, which checks the set here, cannot read {content}; expected 0.6 or later, which the "
+            "installation on Python 3.12 or later has"
+        )
 
 
 def _keys(convention: Convention, content: Content) -> dict[str, str]:
     """Return the ``keys`` of a format under the names of v3.0."""
     keys = {view: spec.lerobot_key for view, spec in content.cameras.items()} | convention.motion_keys
     for view in content.views:
-        keys |= {f"{view}_{name}": camera_column(view, name) for name in (*MATRICES, *MAPS, "boxes")}
+        keys |= {f"{view}_{name}": convention.camera_column(view, name) for name in (*MATRICES, *MAPS, "boxes")}
     return keys | {"provenance": "meta/provenance.parquet", "labels": "meta/episodes"}
 
 
@@ -90,7 +118,7 @@ class LeRobot(Format[LeRobotConfig]):
     maps_stored_as: ClassVar = MAPS_STORED_AS
     flattens_matrices: ClassVar = True
     group: ClassVar = "lerobot"
-    step_s: ClassVar = 0.0015
+    step_s = 0.0015
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
@@ -99,6 +127,7 @@ class LeRobot(Format[LeRobotConfig]):
     def __init__(self, data: Path, options: LeRobotConfig, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
         self.keys = _keys(self._convention, content)
+        self.step_s += DEPTH_MAP_S * content.area * len(self._convention.depth_videos(content))
 
     @property
     def language(self) -> bool:
@@ -106,7 +135,12 @@ class LeRobot(Format[LeRobotConfig]):
 
     @property
     def _convention(self) -> Convention:
-        return Convention(self.options.frames, language=self.language, action=self.options.action)
+        options = self.options
+        return Convention(options.frames, language=self.language, action=options.action, depth=options.depth)
+
+    @property
+    def depth_as_video(self) -> bool:
+        return bool(self._convention.depth_videos(self.content))
 
     @property
     def root(self) -> Path:
@@ -136,10 +170,13 @@ class LeRobot(Format[LeRobotConfig]):
     def _steps_of_a_file(self) -> int:
         """Return the number of steps in a file of ``FILE_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
         views = len(self.content.views) * self.content.area
-        maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in self.content.extras)
+        text_maps = self._convention.text_maps(self.content)
+        maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in text_maps)
         images_kb = 40.0 if self.options.frames == "images" else 0.0
         data_kb = 0.5 + views * (maps_kb + images_kb)
         video_kb = 6.0 * views
+        if self.depth_as_video:
+            video_kb = max(video_kb, DEPTH_MAP_KB * self.content.area)
         return int(1000 * FILE_MB / max(data_kb, video_kb))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
@@ -256,7 +293,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     maps_stored_as: ClassVar = MAPS_STORED_AS
     flattens_matrices: ClassVar = True
     group: ClassVar = LeRobot.group
-    step_s: ClassVar = LeRobot.step_s
+    step_s = LeRobot.step_s
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
 

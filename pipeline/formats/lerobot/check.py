@@ -57,12 +57,17 @@ from pipeline.formats.stated_statistics import (
     unlike_figures,
     wrong_numbers,
 )
+from pipeline.types import Extra
 
 BY_LEROBOT = 8
 """Number of episodes that lerobot reads too, spread over the dataset."""
 
 SAME_LEVELS = 1
 """Largest difference in grey levels of a frame between PyAV and lerobot's decoder."""
+
+
+SAME_DEPTH_M = 1e-5
+"""Largest difference of depth between lerobot's decoding, in single precision, and ours."""
 
 
 def check(
@@ -96,8 +101,10 @@ def check(
     # These faults come first, because lerobot may stop at them with a less specific message.
     yield from (("format", fault) for fault in faults)
     with readable(root, also=(DatasetsError,)):
+        # The option exists from lerobot 0.6 on, as such depth does.
+        in_metres: dict[str, Any] = {"depth_output_unit": "m"} if convention.depth_videos(content) else {}
         with local_only(cache):
-            data = LeRobotDataset(root.name, root=root, video_backend="pyav")
+            data = LeRobotDataset(root.name, root=root, video_backend="pyav", **in_metres)
         stored = (data.meta.total_episodes, data.num_frames)
         wrong = list(_wrong_statistics(root, convention, content))
         split_of = _split_of(root, episodes)
@@ -134,7 +141,7 @@ def _format(
         "video_files_size_in_mb": FILE_MB,
         "fps": SCHEMA.fps_hz,
         "data_path": DATA_PATH,
-        "video_path": VIDEO_PATH if convention.frames == "video" else None,
+        "video_path": VIDEO_PATH if convention.videos(content) else None,
     }
     yield from unlike("lerobot", info, wanted)
     yield from unlike("lerobot", {"fields of info.json": sorted(info)}, {"fields of info.json": _fields(wanted)})
@@ -186,8 +193,7 @@ def _wrong_files(
 ) -> Iterator[Fault]:
     """Compare the existing files with the files that the episodes name."""
     kinds = {"data": ".parquet", "meta/episodes": ".parquet"}
-    if convention.frames == "video":
-        kinds |= {f"videos/{view.lerobot_key}": ".mp4" for view in content.cameras.values()}
+    kinds |= {f"videos/{column}": ".mp4" for column in convention.videos(content).values()}
     wanted = set()
     for row in episodes.values():
         for kind, suffix in kinds.items():
@@ -205,8 +211,7 @@ def _wrong_statistics(root: Path, convention: Convention, content: Content) -> I
     """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
     yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(content))
-    for view in content.cameras.values():
-        column = view.lerobot_key
+    for column in convention.pictures(content).values():
         names = [f"stats/{column}/{figure}" for figure in (*FIGURES, *QUANTILES)]
         tables = [pq.read_table(file, columns=names) for file in episode_files(root)]
         of_episodes = {}
@@ -219,11 +224,13 @@ def _wrong_statistics(root: Path, convention: Convention, content: Content) -> I
 
 def _samples(root: Path, data: Any, convention: Convention, content: Content) -> Iterator[tuple[str, str]]:
     """List each episode and column in which lerobot and ``copy_of`` differ at the sampled steps."""
+    depth_videos = convention.depth_videos(content)
+    extras: tuple[Extra, ...] = ("depth",) if depth_videos else ()
     episodes = sorted(rows(root).values(), key=lambda row: row["episode_index"])
     places = {round(place) for place in np.linspace(0, len(episodes) - 1, BY_LEROBOT)}
     for place in sorted(places):
         row = episodes[place]
-        copy = copy_of(root, row, replace(content, extras=()), convention)
+        copy = copy_of(root, row, replace(content, extras=extras), convention)
         for step in sampled(row["length"]):
             item = data[row["dataset_from_index"] + step]
             for name, key in convention.motion_keys.items():
@@ -234,6 +241,10 @@ def _samples(root: Path, data: Any, convention: Convention, content: Content) ->
                 frame = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
                 if np.abs(frame - copy.frame(view, step)).max() > SAME_LEVELS:
                     yield row[EPISODE_ID], spec.lerobot_key
+            for view, column in depth_videos.items():
+                depth_m = item[column].numpy()[0]
+                if np.abs(depth_m - copy.depth_m[view, step]).max() > SAME_DEPTH_M:
+                    yield row[EPISODE_ID], column
             if item["task"] != copy.instructions[step]:
                 yield row[EPISODE_ID], "task"
 
@@ -428,10 +439,11 @@ def _wrong_in_dataset(stored: Mapping[str, Stored], files: Sequence[Path], colum
         columns: the columns as ``meta/info.json`` should describe them.
     """
     numbers = {name: of["shape"][0] for name, of in columns.items() if of["dtype"] in ("float32", "int64")}
-    frames = {name for name, of in columns.items() if of["dtype"] in ("image", "video")}
-    if stored.keys() != numbers.keys() | frames:
-        yield f"the statistics have the columns {sorted(stored)}", f"{sorted(numbers.keys() | frames)}"
-    for column, width in (numbers | dict.fromkeys(frames, 3)).items():
+    frames = {name: of["shape"][2] for name, of in columns.items() if of["dtype"] in ("image", "video")}
+    widths = numbers | frames
+    if stored.keys() != widths.keys():
+        yield f"the statistics have the columns {sorted(stored)}", f"{sorted(widths)}"
+    for column, width in widths.items():
         yield from complete(column, stored.get(column, {}), (*FIGURES, *QUANTILES), width)
     for column, width in numbers.items():
         if any(complete(column, stored.get(column, {}), (*FIGURES, *QUANTILES), width)):
@@ -453,9 +465,9 @@ def _wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[An
     Args:
         column: the camera's column.
         stored: its statistics over all frames.
-        episodes: name to the statistics of all episodes, (episodes, 3), of the count (episodes, 1).
+        episodes: name to the statistics of all episodes, (episodes, channels), of the count (episodes, 1).
     """
-    if any(complete(column, stored, (*FIGURES, *QUANTILES), 3)):
+    if any(complete(column, stored, (*FIGURES, *QUANTILES), episodes["mean"].shape[1])):
         return
     frames = episodes["count"]
     mean = (frames * episodes["mean"]).sum(axis=0) / frames.sum()

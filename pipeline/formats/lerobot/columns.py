@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from pipeline.episode_schema import ALL_VIEWS, MATRICES, MOTION, SCHEMA, Content, MatrixSpec, PosesSpec
 from pipeline.formats.base import StepSizes
+from pipeline.formats.lerobot import depth
+from pipeline.types import Extra
 
 Frames = Literal["video", "images"]
 """``video`` is H.264 encoded from the stored frames; ``images`` are the stored JPEG files, three times as large."""
@@ -130,6 +132,9 @@ def read_matrix(file: Path, column: str) -> NDArray[Any]:
     return matrix(pq.ParquetFile(file).read([column], use_threads=False), column)
 
 
+Depth = Literal["text", "video"]
+"""``text`` is the stored PNG file in base64; ``video`` is lerobot's own coding, which lerobot reads from 0.6 on."""
+
 Action = Literal["delta", "absolute"]
 """Content of the column ``action``, on which policies train."""
 
@@ -148,6 +153,8 @@ class Convention:
         open_is_one: True if the gripper's command is 1 open, 0 closed, instead of LIBERO's. GR00T and starVLA, which
             read ``meta/modality.json``, expect it.
         language: True if the set has lerobot's language column.
+        action: content of the column ``action``.
+        depth: storage of the depth maps, if the content has them.
     """
 
     frames: Frames
@@ -156,6 +163,7 @@ class Convention:
     open_is_one: bool = False
     language: bool = False
     action: Action = "delta"
+    depth: Depth = "text"
 
     @property
     def motion_keys(self) -> dict[str, str]:
@@ -167,11 +175,43 @@ class Convention:
         """Return the name of a column of v3.0."""
         return self.names.get(column, column)
 
+    def camera_column(self, view: str, name: str) -> str:
+        """Return the column of v3.0 with a view's matrix, map or boxes.
+
+        Depth as video has a name of lerobot's cameras, because lerobot passes no other images to policies.
+        """
+        if name == "depth" and self.depth == "video":
+            return f"{ALL_VIEWS[view].lerobot_key}_depth"
+        return camera_column(view, name)
+
+    def text_maps(self, content: Content) -> list[Extra]:
+        """List the maps that are stored as text."""
+        return [name for name in content.maps if name != "depth" or self.depth == "text"]
+
+    def depth_videos(self, content: Content) -> dict[str, str]:
+        """Map each view to its column of depth as video; empty where depth is text or absent."""
+        if self.depth == "text" or "depth" not in content.maps:
+            return {}
+        return {view: self.camera_column(view, "depth") for view in content.views}
+
+    def pictures(self, content: Content) -> dict[str, str]:
+        """Map the name of each view, and of its depth if that is a video, to its column of v3.0."""
+        columns = {view: spec.lerobot_key for view, spec in content.cameras.items()}
+        return columns | {f"{view}_depth": column for view, column in self.depth_videos(content).items()}
+
+    def videos(self, content: Content) -> dict[str, str]:
+        """Return the part of ``pictures`` that is stored as videos."""
+        columns = self.pictures(content)
+        if self.frames == "video":
+            return columns
+        return {name: column for name, column in columns.items() if name not in content.views}
+
     def step_kb(self, sizes: StepSizes, content: Content) -> float:
         """Estimate the size of one step of an episode, in KB."""
         views = len(content.views)
         video_kb = VIEW_AS_VIDEO_KB * views * content.area
         frames_kb = video_kb if self.frames == "video" else views * sizes.frame_kb + sizes.motion_kb
+        # Depth as video counts as text here, of which it takes a third.
         return frames_kb + IN_TEXT * views * sizes.maps_kb + sizes.poses_kb
 
     def columns(self, content: Content) -> dict[str, dict[str, Any]]:
@@ -185,7 +225,10 @@ class Convention:
             spec = getattr(SCHEMA, name)
             columns[key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
         columns[EPISODE_ID] = dict(text)
-        columns |= {camera_column(view, name): dict(text) for view in content.views for name in content.maps}
+        columns |= {camera_column(view, name): dict(text) for view in content.views for name in self.text_maps(content)}
+        height, width, _ = content.frame_shape
+        for column in self.depth_videos(content).values():
+            columns[column] = {"dtype": "video", "shape": (height, width, 1), "names": list(SCHEMA.frame.names)}
         if "boxes" in content.extras:
             columns |= {camera_column(view, "boxes"): _flat(SCHEMA.boxes) for view in content.views}
         if "object_poses" in content.extras:
@@ -198,11 +241,13 @@ class Convention:
 
     def described(self, content: Content) -> dict[str, dict[str, Any]]:
         """Describe the columns as ``meta/info.json`` does, videos with the properties of their encoding."""
-        size = dict(zip(("video.height", "video.width", "video.channels"), content.frame_shape, strict=True))
+        depths = set(self.depth_videos(content).values())
         columns = {}
         for name, description in self.columns(content).items():
-            encoding = {"info": size | VIDEO_INFO} if description["dtype"] == "video" else {}
-            columns[name] = {**description, **encoding}
+            columns[name] = dict(description)
+            if description["dtype"] == "video":
+                size = dict(zip(("video.height", "video.width", "video.channels"), description["shape"], strict=True))
+                columns[name]["info"] = size | (depth.INFO if name in depths else VIDEO_INFO)
         return columns
 
 

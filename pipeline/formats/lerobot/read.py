@@ -30,9 +30,10 @@ from pipeline.formats.lerobot.columns import (
     matrix,
     video_path_v21,
 )
+from pipeline.formats.lerobot.depth import PIXEL_FORMAT, metres_of
 from pipeline.formats.read_back import Copy, Statistics, sampled, subtasks_of
 from pipeline.formats.stated_statistics import QUANTILES
-from pipeline.types import Episode, Frame, Geometry
+from pipeline.types import Episode, Geometry
 
 UNREADABLE = (
     AssertionError,
@@ -119,21 +120,20 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
     if row["dataset_to_index"] != row["dataset_from_index"] + steps or row["tasks"] != [instructions[0]]:
         stated = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
         raise ValueError(f"episode {index} of {steps} steps, {instructions[0]!r}, {stated}")
-    videos = {}
+    depth_columns = convention.depth_videos(content)
+    videos, depth_videos = {}, {}
     for view, spec in content.cameras.items():
-        key = spec.lerobot_key
-        if info["features"][key]["dtype"] == "video":
-            chunk, number = _file(row, f"videos/{key}")
-            path = root / info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
-            first_s, end_s = row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"]
-            if round((end_s - first_s) * SCHEMA.fps_hz) != steps:
-                raise ValueError(f"episode {index} of {steps} steps has {first_s} to {end_s} s of {path.name}")
-            videos[view] = path, first_s
+        if info["features"][spec.lerobot_key]["dtype"] == "video":
+            videos[view] = _video_place(root, info, row, spec.lerobot_key)
+        if view in depth_columns:
+            depth_videos[view] = _video_place(root, info, row, depth_columns[view])
+    times_s = table["timestamp"].to_pylist()
+    codes = decoded(times_s, depth_videos, PIXEL_FORMAT)
     return Copy(
         dataset="lerobot",
         episode=episode(table, row, instructions[0], content, convention),
         instructions=instructions,
-        decoded=decoded(table["timestamp"].to_pylist(), videos),
+        decoded=decoded(times_s, videos),
         marks={name: table[name].to_numpy() for name in MARKS},
         place={"lerobot_episode_index": index},
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
@@ -143,8 +143,25 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
             numbers={name: matrix(table, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
             views={view: spec.lerobot_key for view, spec in content.cameras.items()},
             quantiles=QUANTILES,
+            depth=depth_columns,
         ),
+        depth_m={place: metres_of(each) for place, each in codes.items()},
     )
+
+
+def _video_place(root: Path, info: Mapping[str, Any], row: Mapping[str, Any], column: str) -> tuple[Path, float]:
+    """Return the video of an episode's column, and the time (s) at which the episode begins in it.
+
+    Raises:
+        ValueError: when the stated times do not fit the episode's length.
+    """
+    chunk, number = _file(row, f"videos/{column}")
+    path = root / info["video_path"].format(video_key=column, chunk_index=chunk, file_index=number)
+    first_s, end_s = row[f"videos/{column}/from_timestamp"], row[f"videos/{column}/to_timestamp"]
+    index, steps = row["episode_index"], row["length"]
+    if round((end_s - first_s) * SCHEMA.fps_hz) != steps:
+        raise ValueError(f"episode {index} of {steps} steps has {first_s} to {end_s} s of {path.name}")
+    return path, first_s
 
 
 def episode_files(root: Path) -> list[Path]:
@@ -213,7 +230,7 @@ def episode(
         action_absolute=motion["action_absolute"],
         instruction=instruction,
         provenance=row,
-        geometry={view: _geometry(table, row, view, content) for view in content.views},
+        geometry={view: _geometry(table, row, view, content, convention) for view in content.views},
         object_poses=_object_poses(table) if "object_poses" in content.extras else None,
         instances=json.loads(row[INSTANCES]) if content.has_names else (),
         rewrites=row["rewrites"],
@@ -243,12 +260,12 @@ def _object_poses(table: pa.Table) -> NDArray[np.float32]:
     return matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
 
 
-def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, content: Content) -> Geometry:
+def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, content: Content, convention: Convention) -> Geometry:
     matrices = {}
     for name in MATRICES:
         numbers = np.array(row[camera_column(view, name)], np.float32)
         matrices[name] = numbers.reshape(getattr(SCHEMA, name).shape)
-    texts = {name: table[camera_column(view, name)].to_pylist() for name in content.maps}
+    texts = {name: table[camera_column(view, name)].to_pylist() for name in convention.text_maps(content)}
     maps = {name: list(map(base64.b64decode, files)) for name, files in texts.items()}
     boxes = None
     if "boxes" in content.extras:
@@ -256,12 +273,15 @@ def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, content: Conte
     return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
-def decoded(times_s: Sequence[float], videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:
+def decoded(
+    times_s: Sequence[float], videos: Mapping[str, tuple[Path, float]], pixel_format: str = "rgb24"
+) -> dict[tuple[str, int], NDArray[Any]]:
     """Decode the frames at the sampled steps.
 
     Args:
         times_s: timestamps of the steps, by which lerobot finds a frame.
         videos: view to its video, and the time (s) at which the episode begins in the video.
+        pixel_format: format of the frames.
 
     Returns:
         (view, step) to the frame.
@@ -269,13 +289,13 @@ def decoded(times_s: Sequence[float], videos: Mapping[str, tuple[Path, float]]) 
     steps = sampled(len(times_s))
     frames = {}
     for view, (path, begins_s) in videos.items():
-        frames_of_view = frames_at(path, [begins_s + times_s[step] for step in steps])
+        frames_of_view = frames_at(path, [begins_s + times_s[step] for step in steps], pixel_format)
         for step, frame in zip(steps, frames_of_view, strict=True):
             frames[view, step] = frame
     return frames
 
 
-def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
+def frames_at(path: Path, times_s: Sequence[float], pixel_format: str = "rgb24") -> list[NDArray[Any]]:
     """Decode the frames of a video that begin at these times.
 
     Raises:
@@ -290,18 +310,18 @@ def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
         frame = next(from_then_on, None)
         if frame is None or frame.pts != at:
             raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
-        frames.append(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8))
+        frames.append(frame.to_ndarray(format=pixel_format))
     return frames
 
 
 _VIDEOS: dict[Edition, av.container.InputContainer] = {}
-"""Open videos, as many as an episode may have views."""
+"""Open videos, as many as an episode may have, with those of depth."""
 
 
 def _video(file: Edition) -> av.container.InputContainer:
     """Open a video and keep it open for a while, because a caller probably asks for its next frames."""
     if file not in _VIDEOS:
-        while len(_VIDEOS) >= len(ALL_VIEWS):
+        while len(_VIDEOS) >= 2 * len(ALL_VIEWS):
             _VIDEOS.pop(next(iter(_VIDEOS))).close()
         _VIDEOS[file] = av.open(str(file.path))
         _VIDEOS[file].streams.video[0].thread_count = 1  # Starting more takes longer than a few frames.

@@ -17,12 +17,12 @@ import base64
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import av
 import cv2
@@ -37,6 +37,7 @@ from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, STANDARD, Conte
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, listed, of_levels, open_is_one
+from pipeline.formats.lerobot import depth
 from pipeline.formats.lerobot.columns import (
     DATA_PATH,
     DATA_PATH_V21,
@@ -54,14 +55,13 @@ from pipeline.formats.lerobot.columns import (
     VIDEO_PATH,
     VIDEO_PATH_V21,
     Convention,
-    Frames,
     camera_column,
     data_path_v21,
     matrix_columns,
     read_matrix,
     video_path_v21,
 )
-from pipeline.images.jpeg import decode
+from pipeline.images.jpeg import decode, decode_exactly
 from pipeline.types import Episode, Frame
 
 PROVENANCE, LEVELS = "provenance.parquet", "levels.json"
@@ -105,12 +105,16 @@ _LANGUAGE_TYPE = datasets.List(
 class Video:
     """A file that is written frame by frame; it is complete when the block ends."""
 
+    encoder: ClassVar[str] = ENCODER
+    encoder_options: ClassVar[dict[str, str]] = ENCODER_OPTIONS
+    pixel_format: ClassVar[str] = str(VIDEO_INFO["video.pix_fmt"])
+
     def __init__(self, path: Path, content: Content = STANDARD) -> None:
         self.frames = 0
         self._file = av.open(str(path), "w")
-        self._stream = self._file.add_stream(ENCODER, SCHEMA.fps_hz, options=ENCODER_OPTIONS)
+        self._stream = self._file.add_stream(self.encoder, SCHEMA.fps_hz, options=self.encoder_options)
         self._stream.height, self._stream.width, _ = content.frame_shape
-        self._stream.pix_fmt = VIDEO_INFO["video.pix_fmt"]
+        self._stream.pix_fmt = self.pixel_format
 
     def __enter__(self) -> Self:
         return self
@@ -127,12 +131,31 @@ class Video:
             pixels: the frame.
             first: True if it is the first frame of an episode.
         """
-        frame = av.VideoFrame.from_numpy_buffer(planes(pixels), format=VIDEO_INFO["video.pix_fmt"])
+        self._append(av.VideoFrame.from_numpy_buffer(planes(pixels), format=self.pixel_format), first)
+
+    def _append(self, frame: av.VideoFrame, first: bool) -> None:
         frame.pts, frame.time_base = self.frames, Fraction(1, SCHEMA.fps_hz)
         if first:
             frame.pict_type = PictureType.I
         self._file.mux(self._stream.encode(frame))
         self.frames += 1
+
+
+class DepthVideo(Video):
+    """Depth maps in lerobot's codes, stored without loss."""
+
+    encoder = depth.ENCODER
+    encoder_options = depth.ENCODER_OPTIONS
+    pixel_format = depth.PIXEL_FORMAT
+
+    def add_map(self, values: NDArray[np.uint16], *, first: bool) -> None:
+        """Append a depth map (H, W) in the schema's unit.
+
+        Args:
+            values: the map.
+            first: True if it is the first map of an episode.
+        """
+        self._append(av.VideoFrame.from_ndarray(depth.codes_of(values), format=self.pixel_format), first)
 
 
 def planes(pixels: Frame) -> NDArray[np.uint8]:
@@ -204,6 +227,23 @@ def _append_frames(episode: Episode, view: str, video: Video | None) -> Counts:
     return counts
 
 
+def _append_depth(episode: Episode, view: str, video: DepthVideo) -> Counts:
+    """Append a view's depth maps to its video, and return the counts of their depths.
+
+    Raises:
+        PipelineError: when a map cannot be decoded.
+    """
+    counts = np.zeros(depth.DEPTHS, np.int64)
+    for t, packed in enumerate(episode.geometry[view].maps["depth"]):
+        try:
+            values = decode_exactly(packed)
+        except ValueError as error:
+            raise PipelineError(f"{view} depth {t}: {error}", where=f"episode {episode.episode_id}") from error
+        counts += np.bincount(values.ravel(), minlength=depth.DEPTHS)
+        video.add_map(values, first=t == 0)
+    return counts[None]
+
+
 def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, convention: Convention) -> Numbers:
     steps, task = np.arange(len(episode)), piece.tasks[episode.instruction]
     numbers: dict[str, NDArray[Any]] = {key: getattr(episode, name) for name, key in convention.motion_keys.items()}
@@ -221,14 +261,14 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, conven
     }
 
 
-def _step_columns(episode: Episode, found: Numbers, frames: Frames) -> dict[str, pa.Array]:
-    """Return the columns of an episode's steps, with its images if ``frames`` is ``images``."""
+def _step_columns(episode: Episode, found: Numbers, convention: Convention, content: Content) -> dict[str, pa.Array]:
+    """Return the columns of an episode's steps, with its images if they are stored as such."""
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, geometry in episode.geometry.items():
-        for extra, files in geometry.maps.items():
-            texts[camera_column(view, extra)] = [base64.b64encode(file).decode() for file in files]
+        for extra in convention.text_maps(content):
+            texts[camera_column(view, extra)] = [base64.b64encode(file).decode() for file in geometry.maps[extra]]
     images = {}
-    if frames == "images":
+    if convention.frames == "images":
         image_type = datasets.Image().pa_type
         for view, files in episode.frames.items():
             cells = [{"bytes": packed, "path": None} for packed in files]
@@ -263,14 +303,27 @@ def _language_column(episode: Episode, train: bool) -> dict[str, pa.Array]:
     return {LANGUAGE: pa.concat_arrays([once] * len(episode))}
 
 
-def _episode_statistics(found: Numbers, shown: Mapping[str, Counts]) -> dict[str, dict[str, NDArray[Any]]]:
-    """Compute lerobot's statistics of an episode by column: (D,) of numbers, (3, 1, 1) of frames; ``count`` is (1,)."""
+def _picture_statistics(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
+    """Compute lerobot's statistics of frames, in [0, 1], or of depth maps, which have one channel, in metres."""
+    return of_levels(counts, frames) if len(counts) == 3 else of_levels(counts, frames, depth.UNITS_PER_M)
+
+
+def _episode_statistics(
+    found: Numbers, shown: Mapping[str, Counts], columns: Mapping[str, str]
+) -> dict[str, dict[str, NDArray[Any]]]:
+    """Compute lerobot's statistics of an episode by column: (D,) of numbers, (3, 1, 1) of frames; ``count`` is (1,).
+
+    Args:
+        found: the columns of numbers.
+        shown: counts of levels by the names of ``columns``.
+        columns: ``Convention.pictures``.
+    """
     of_numbers = {}
     for name, values in found.items():
         rows = values.reshape(len(values), -1)
         of_numbers[name] = describe(rows, QUANTILES) | {"count": np.array([len(values)])}
     steps = len(found["timestamp"])
-    return of_numbers | {ALL_VIEWS[view].lerobot_key: of_levels(counts, steps) for view, counts in shown.items()}
+    return of_numbers | {columns[name]: _picture_statistics(counts, steps) for name, counts in shown.items()}
 
 
 def _provenance_schema(content: Content) -> pa.Schema:
@@ -303,9 +356,9 @@ def _write_summary(path: Path, made: Sequence[tuple[dict[str, Any], Mapping[str,
     rows, counts_of_episodes = zip(*made, strict=True)
     pq.write_table(pa.Table.from_pylist(list(rows), schema=_provenance_schema(content)), path / PROVENANCE)
     levels = {}
-    for view in content.views:
-        total = sum(counts[view] for counts in counts_of_episodes)
-        levels[view] = total.tolist()
+    for name in counts_of_episodes[0]:
+        total = sum(counts[name] for counts in counts_of_episodes)
+        levels[name] = total.tolist()
     (path / LEVELS).write_text(json.dumps(levels))
 
 
@@ -318,9 +371,10 @@ def _write_common(
     columns = convention.columns(content)
     levels_of_pieces = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
     figures = {}
-    for view, spec in content.cameras.items():
-        total = np.sum([levels[view] for levels in levels_of_pieces], axis=0)
-        figures[convention.name(spec.lerobot_key)] = of_levels(total, pieces[-1].first_step + pieces[-1].steps)
+    for picture, column in convention.pictures(content).items():
+        total = np.sum([levels[picture] for levels in levels_of_pieces], axis=0)
+        steps = pieces[-1].first_step + pieces[-1].steps
+        figures[convention.name(column)] = _picture_statistics(total, steps)
     for name, description in columns.items():
         if description["dtype"] in ("float32", "int64"):
             figures[name] = _exact(root, name, description["shape"][0])
@@ -412,21 +466,25 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, co
     rows, made = [], []
     with ExitStack() as opened:
         data = opened.enter_context(pq.ParquetWriter(path / DATA, _data_schema(convention.columns(content))))
-        videos = {}
+        videos, depth_videos = {}, {}
         if convention.frames == "video":
             for view in content.views:
                 videos[view] = opened.enter_context(Video(path / f"{view}.mp4", content))
+        for view in convention.depth_videos(content):
+            depth_videos[view] = opened.enter_context(DepthVideo(path / f"{view}_depth.mp4", content))
         for index, first_step, episode, numbers in _load_each(piece, load, convention, content):
             levels = {view: _append_frames(episode, view, videos.get(view)) for view in content.views}
-            columns = _step_columns(episode, numbers, convention.frames)
+            for view, video in depth_videos.items():
+                levels[f"{view}_depth"] = _append_depth(episode, view, video)
+            columns = _step_columns(episode, numbers, convention, content)
             if convention.language:
                 columns |= _language_column(episode, piece.split == "train")
             # Each episode is a row group of its own, so that it can be read alone.
             table = pa.table({name: columns[name] for name in data.schema.names})
             data.write_table(table.cast(data.schema))
-            row = _episode_row(episode, piece, index, first_step, convention.frames)
+            row = _episode_row(episode, piece, index, first_step, convention.videos(content).values())
             # lerobot's tools for editing aggregate the statistics of the episodes.
-            for name, figures in _episode_statistics(numbers, levels).items():
+            for name, figures in _episode_statistics(numbers, levels, convention.pictures(content)).items():
                 row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
             rows.append(row)
             made.append((_provenance_row(episode, index), levels))
@@ -444,7 +502,7 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
     """Link the files of all pieces to their places below ``root``, and write the files about all episodes."""
     for piece in pieces:
         places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
-        places |= {f"{view}.mp4": (f"videos/{spec.lerobot_key}", ".mp4") for view, spec in content.cameras.items()}
+        places |= {f"{name}.mp4": (f"videos/{column}", ".mp4") for name, column in convention.videos(content).items()}
         for name, (kind, suffix) in places.items():
             made = work / piece.path / name
             if made.exists():
@@ -467,13 +525,15 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
         "fps": SCHEMA.fps_hz,
         "splits": {name: f"{first}:{end}" for name, (first, end) in splits.items()},
         "data_path": DATA_PATH,
-        "video_path": VIDEO_PATH if convention.frames == "video" else None,
+        "video_path": VIDEO_PATH if convention.videos(content) else None,
         "features": convention.described(content),
     }
     _write_json(root / "meta" / "info.json", info)
 
 
-def _episode_row(episode: Episode, piece: Piece, index: int, first_step: int, frames: Frames) -> dict[str, Any]:
+def _episode_row(
+    episode: Episode, piece: Piece, index: int, first_step: int, video_columns: Iterable[str]
+) -> dict[str, Any]:
     """Return an episode's row of ``meta/episodes``, which states its place."""
     chunk, file = divmod(piece.number, FILES_OF_A_CHUNK)
     steps = len(episode)
@@ -490,8 +550,7 @@ def _episode_row(episode: Episode, piece: Piece, index: int, first_step: int, fr
     }
     row |= labels_of(episode)
     before = first_step - piece.first_step
-    for view in episode.frames if frames == "video" else ():
-        key = ALL_VIEWS[view].lerobot_key
+    for key in video_columns:
         row |= {
             f"videos/{key}/chunk_index": chunk,
             f"videos/{key}/file_index": file,
@@ -519,7 +578,7 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
         for index, _, episode, numbers in _load_each(piece, load, convention, content):
             levels = _write_episode_v21(path, index, episode, numbers, convention, content)
             figures = {}
-            for name, all_figures in _episode_statistics(numbers, levels).items():
+            for name, all_figures in _episode_statistics(numbers, levels, convention.pictures(content)).items():
                 figures[convention.name(name)] = listed({figure: all_figures[figure] for figure in STATISTICS_V21})
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
             row |= {"episode_id": episode.episode_id, **labels_of(episode)}
@@ -547,7 +606,7 @@ def _write_episode_v21(
                 levels[view] = _append_frames(episode, view, video)
         else:
             levels[view] = _append_frames(episode, view, None)
-    v30_columns = _step_columns(episode, numbers, convention.frames)
+    v30_columns = _step_columns(episode, numbers, convention, content)
     columns = {convention.name(name): values for name, values in v30_columns.items()}
     schema = _data_schema_v21(convention, content)
     file = path / data_path_v21(index)
