@@ -106,7 +106,7 @@ def _training_and_clients(
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
     values |= {"rewrite_probability": rewrite_probability}
-    values |= {"inputs": _inputs_without_depth(export, content)}
+    values |= {"inputs": _evaluated_inputs(export, content)}
     values |= {"robomimic_config": ROBOMIMIC_CONFIG}
     values |= {"ipec_set": _v21_of(export, "ipec"), "openpi_set": _v21_of(export, "openpi")}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
@@ -114,17 +114,19 @@ def _training_and_clients(
     return {**sections, "clients_of_other_formats": missing} if missing else sections
 
 
-def _inputs_without_depth(export: ExportConfig, content: Content) -> str:
-    """Return the option of lerobot-train that leaves depth videos out of a policy's inputs; empty without such videos.
+def _evaluated_inputs(export: ExportConfig, content: Content) -> str:
+    """Return the option of lerobot-train that restricts a policy's inputs to the state and LIBERO's two views.
 
-    Otherwise lerobot passes all videos to a policy, whose image encoder requires three channels.
+    Otherwise lerobot passes all images to a policy: further views, which an evaluation lacks, and depth videos, which
+    image encoders reject. The option is empty if the dataset has neither.
     """
     lerobot = export.options_for(LeRobot)
-    if lerobot is None or lerobot.depth == "text":
+    has_other_images = len(content.views) > len(SCHEMA.views) or (lerobot is not None and lerobot.depth == "video")
+    if not has_other_images:
         return ""
     height, width, channels = content.frame_shape
     features: dict[str, Any] = {SCHEMA.state.lerobot_key: {"type": "STATE", "shape": list(SCHEMA.state.shape)}}
-    for view in content.cameras.values():
+    for view in SCHEMA.views.values():
         features[view.lerobot_key] = {"type": "VISUAL", "shape": [channels, height, width]}
     return f" --policy.input_features='{json.dumps(features)}'"
 

@@ -8,6 +8,7 @@ import arenas
 import mujoco
 import numpy as np
 import pytest
+import yaml
 from conftest import BOWL, STOVE, link_testset, run_stages, tiny_config
 from libero_environment import OffScreenRenderEnv
 
@@ -182,6 +183,10 @@ def test_a_run_of_small_frames_with_a_further_view(short_demos: Path, tmp_path: 
             assert decode(files[0]).shape == (96, 96, 3)
     readme = (tmp_path / "data" / "tiny" / "card" / "lerobot" / "README.md").read_text()
     assert "96x96 RGB" in readme
+    recipe = yaml.safe_load((tmp_path / "data" / "tiny" / "finetune" / "finetune.yaml").read_text())
+    command = recipe["clients"]["lerobot_act"]["command"]
+    assert '"observation.images.image2": {"type": "VISUAL", "shape": [3, 96, 96]}' in command
+    assert "images.front" not in command, "an evaluation has no front view"
     assert "`observation.images.front` from the camera frontview" in readme
 
 
