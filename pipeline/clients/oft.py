@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, SIZE_PX
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats import exact_statistics
@@ -135,11 +135,12 @@ def normalise(values: NDArray[np.float32], figures: Mapping[str, Any]) -> NDArra
     return np.where(smallest == largest, 0.0, np.where(mask, scaled, values)).astype(np.float32)
 
 
-def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
+def check(folder: Path, statistics: Mapping[str, Any], size_px: int = SIZE_PX) -> dict[str, Any]:
     """Read a dataset as OFT would and report counts and violations, JSON-serialisable.
 
     Args:
         statistics: content of ``dataset_statistics.json``: dataset to its statistics.
+        size_px: height and width of the frames.
 
     Returns:
         Dictionary with these keys. If ``statistics`` lacks the dataset, it has ``violations`` only. If OFT would train
@@ -160,7 +161,7 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
     episodes = clipped = 0
     for episode in read(folder):
         episodes += 1
-        faults = list(_faults(episode))
+        faults = list(_faults(episode, size_px))
         violations += [f"{episode.name}: {fault}" for fault in faults]
         if faults:
             continue
@@ -191,7 +192,7 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def check_all(rlds: Path, statistics_file: Path) -> dict[str, dict[str, Any]]:
+def check_all(rlds: Path, statistics_file: Path, size_px: int = SIZE_PX) -> dict[str, dict[str, Any]]:
     """Check every dataset below a folder against ``dataset_statistics.json``; keys are dataset names.
 
     Raises:
@@ -199,10 +200,10 @@ def check_all(rlds: Path, statistics_file: Path) -> dict[str, dict[str, Any]]:
     """
     folders = datasets(rlds)
     statistics = read_json(statistics_file)
-    return {folder.parent.name: check(folder, statistics) for folder in folders}
+    return {folder.parent.name: check(folder, statistics, size_px) for folder in folders}
 
 
-def _faults(episode: Recorded) -> Iterator[str]:
+def _faults(episode: Recorded, size_px: int) -> Iterator[str]:
     """Yield a text for each fault of an episode."""
     steps = len(episode.action)
     if steps < CHUNK:
@@ -217,17 +218,16 @@ def _faults(episode: Recorded) -> Iterator[str]:
     if np.abs(episode.action).max(initial=0.0) > 1:
         yield "action leaves [-1, 1]"
     for view, frames in episode.frames.items():
-        wrong = sum(not _is_frame(frame) for frame in frames)
+        wrong = sum(not _is_frame(frame, size_px) for frame in frames)
         if wrong or len(frames) != steps:
-            yield f"{view}: {wrong} of {len(frames)} frames are not {SCHEMA.frame.shape} JPEG, {steps} expected"
+            yield f"{view}: {wrong} of {len(frames)} frames are not {(size_px, size_px, 3)} JPEG, {steps} expected"
 
 
-def _is_frame(data: bytes) -> bool:
-    """Return whether an encoded image is an RGB JPEG of the schema's size."""
-    height, width, _ = SCHEMA.frame.shape
+def _is_frame(data: bytes, size_px: int) -> bool:
+    """Return whether an encoded image is a square RGB JPEG of a size."""
     try:
         with Image.open(io.BytesIO(data)) as image:  # reads the header only
-            return (image.format, image.mode, image.size) == ("JPEG", "RGB", (width, height))
+            return (image.format, image.mode, image.size) == ("JPEG", "RGB", (size_px, size_px))
     except UnidentifiedImageError:
         return False
 

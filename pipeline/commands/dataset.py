@@ -50,7 +50,7 @@ def check(config: Path) -> int:
     trained: dict[str, Any] = {}
     # OpenVLA-OFT's reader stops at damaged files.
     if "rlds" in run.config.export.formats and not stored["rlds"]["damaged"]:
-        trained = oft.check_all(run.dataset("rlds").folder, run.path(STATISTICS))
+        trained = oft.check_all(run.dataset("rlds").folder, run.path(STATISTICS), run.config.render.size_px)
     misleading: list[str] = []
     for name, findings in trained.items():
         misleading += [f"{name}: {violation}" for violation in findings["violations"]]

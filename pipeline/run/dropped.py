@@ -19,7 +19,7 @@ from pipeline.run.outcome import MISSED, rejections, rendered
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
-from pipeline.stores.frame_store import frames_by_trajectory
+from pipeline.stores.frame_store import frames_by_trajectory, settings_of
 from pipeline.types import Verdict
 
 LARGEST_SHARE = 0.1
@@ -73,7 +73,7 @@ def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
     """
     trajectories, streams = _needed(rows, run)
     speed = machine.known_speed(run) or REFERENCE
-    encoded = run.config.render.model_dump(mode="json")
+    encoded = settings_of(run.config.render)
     all_s = dropped_s = 0.0
     unneeded_streams = 0
     replayed = run.trajectories.rows_of_all_settings()

@@ -73,8 +73,7 @@ class FrameStore(Store):
     def __init__(self, root: Path, render_config: RenderConfig):
         schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
         maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS, "boxes"} & {*render_config.extras} else {}
-        settings = render_config.model_dump(mode="json", exclude={"views"})
-        super().__init__(root, settings, {"episode schema": schema, **maps})
+        super().__init__(root, settings_of(render_config), {"episode schema": schema, **maps})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
@@ -202,6 +201,11 @@ class FrameStore(Store):
 
     def _files_of(self, trajectory_id: str) -> list[str]:
         return sorted(f"{trajectory_id}/{path.stem}" for path in self.folder(trajectory_id).glob(f"*{SUFFIX}"))
+
+
+def settings_of(render_config: RenderConfig) -> dict[str, Any]:
+    """Return the settings on which a stored stream depends; a further view is a stream of its own."""
+    return render_config.model_dump(mode="json", exclude={"views"})
 
 
 def file_name(trajectory_id: str, streams: Iterable[str]) -> str:

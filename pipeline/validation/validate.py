@@ -126,7 +126,10 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
         work.append(partial(_as_a_whole, dataset, episodes, job.cache))
     if not job.of_failures and any(dataset.name == "rlds" for dataset in job.formats):
         statistics = read_json(job.run.path(STATISTICS))
-        work += [partial(_openvla_oft, statistics, folder) for folder in datasets(job.run.dataset("rlds").folder)]
+        work += [
+            partial(_openvla_oft, statistics, folder, job.run.config.render.size_px)
+            for folder in datasets(job.run.dataset("rlds").folder)
+        ]
     work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
     for results in workers(call, work, "validate"):
         total.add(results)
@@ -177,9 +180,9 @@ def _as_a_whole(dataset: Format[Any], episodes: Mapping[str, Row], cache: Path) 
     return results
 
 
-def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> Results:
+def _openvla_oft(statistics: Mapping[str, Any], folder: Path, size_px: int) -> Results:
     try:
-        wrong = oft.check(folder, statistics)["violations"]
+        wrong = oft.check(folder, statistics, size_px)["violations"]
     except PipelineError as error:
         wrong = [str(error)]  # The reader stops at the first damaged file.
     results, name = Results(), folder.parent.name
