@@ -42,7 +42,7 @@ def by_task(kept: Rows) -> Table:
     """Tabulate the kept episodes and their action sequences by task, with totals."""
     body: list[tuple[Cell, ...]] = []
     for task, figures in {**diversity(kept), "all": Diversity.of(kept)}.items():
-        share = figures.sequences / figures.episodes
+        share = figures.sequences / figures.episodes if figures.episodes else None
         numbers = (Cell(f"{figures.episodes:,}"), Cell(f"{figures.sequences:,}", share), Cell(f"{figures.original:,}"))
         body.append((Cell(task), *numbers))
     head = ("task", "episodes", "distinct sequences", "as recorded")

@@ -104,7 +104,7 @@ def test_an_error_while_a_command_is_imported_has_its_remedy_too() -> None:
     ("words", "position", "offered"),
     [
         ("perturbed-libero sta", 1, {"status"}),
-        ("perturbed-libero dataset ", 2, {"check", "audit", "regenerate", "push"}),
+        ("perturbed-libero dataset ", 2, {"check", "audit", "regenerate", "compare-frame", "push"}),
         ("perturbed-libero preview TASK c", 3, {"camera"}),
         ("perturbed-libero clean --only t", 3, {"trajectories", "tables"}),
     ],

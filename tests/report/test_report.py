@@ -64,7 +64,7 @@ def _rendered(**values: Any) -> str:
     names = ("yields", "axes", "overall", "lengths", "quality", "worst", "seen", "rewrites", "videos", "shortfalls")
     tables = ("headline", "by_axis", "coverage", "leakage", "sheets", "previews", "versions", "origins")
     empty: dict[str, Any] = {**dict.fromkeys(names, ()), **{name: {} for name in tables}}
-    texts = {"name": "tiny", "example": "", "settings": "", "sample": seen.SAMPLE}
+    texts = {"name": "tiny", "example": "", "settings": "", "sample": seen.SAMPLE, "diversity": yields.by_task([])}
     return " ".join(Page(pages.render("report.html.j2", **{**empty, **texts, **values})).text.split())
 
 
