@@ -24,6 +24,7 @@ import numpy as np
 from pipeline.config import ReplayConfig
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import tasks
+from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
 from pipeline.physics.subtasks import subtasks
@@ -115,4 +116,5 @@ def main(listing: Path) -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main(Path(sys.argv[1]))
