@@ -121,7 +121,7 @@ class EpisodeSchema(Frozen):
 
     Attributes:
         views: name of each view of every episode to its camera.
-        further_views: the same of the views that a run has on request.
+        further_views: name of each view that a run may request to its camera.
         frame: storage of frames of the default size.
         provenance: name of each provenance column, as in the manifest, to its type.
         labels: name of each list of an episode's texts and their places, as in the manifest, to the type of its values.

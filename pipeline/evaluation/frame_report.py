@@ -160,6 +160,16 @@ def compare_frame(
     return Report(_raw_difference(picture, found.expected), findings, found)
 
 
+def refuse_existing(file: Path) -> None:
+    """Reject a file that exists, which ``write_sheet`` would replace.
+
+    Raises:
+        PipelineError: if the file exists.
+    """
+    if file.exists():
+        raise PipelineError("the file exists", where=file, expected="a new file", remedy="name another file")
+
+
 def write_sheet(report: Report, file: Path) -> None:
     """Write the picture, our frame and their difference side by side as a PNG file.
 
@@ -168,8 +178,7 @@ def write_sheet(report: Report, file: Path) -> None:
     Raises:
         PipelineError: if the file exists.
     """
-    if file.exists():
-        raise PipelineError("the file exists", where=file, expected="a new file", remedy="name another file")
+    refuse_existing(file)
     match = report.found.match
     picture = resized(match.variant.pixels, SIZE_PX, SIZE_PX)
     apart = np.abs(picture.astype(np.int16) - match.frame.astype(np.int16))

@@ -89,7 +89,9 @@ def _evaluated(row: Mapping[str, Any]) -> Row:
         trials=str(fewest) if fewest == most else f"{fewest} to {most}",
         left_out=protocol["left_out"],
         rates={heading: _percent(measured[heading]["rate"]) if heading in measured else None for heading in COLUMNS},
-        intervals={name: (_percent(one["low"]), _percent(one["high"])) for name, one in measured.items()},
+        intervals={
+            heading: (_percent(estimate["low"]), _percent(estimate["high"])) for heading, estimate in measured.items()
+        },
         partial=frozenset([*absent, "total", "mean of seven"] if absent else ()),
         tasks_run={**tasks_run, "total": sum(tasks_run.values())},
         absent=absent,

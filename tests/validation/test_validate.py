@@ -147,9 +147,10 @@ def named(rows: Rows) -> dict[str, tuple[str, Task] | str]:
     return names
 
 
-def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
+def spoil_rlds(data: Path, rows: Rows, names: Mapping[str, tuple[str, Task] | str]) -> None:
     """Write every shard again, with faults in the examples."""
-    load = EpisodeLoader(data, RenderConfig())
+    rewrites = {row["episode_id"]: json.loads(row["rewrites"]) for row in rows if row["kept"]}
+    load = EpisodeLoader(data, RenderConfig(), rewrites=rewrites)
     for shard in (data / "rlds").rglob("*.tfrecord-*"):
         ids = [columns(record, rlds_write.features())[f"{METADATA}episode_id"][0].decode() for record in records(shard)]
         with shard.open("wb") as file:
@@ -254,7 +255,7 @@ def test_planted_faults_stop_the_run_and_nothing_else_is_found(
     rows = manifest.read(data / "manifest.parquet")
     names = named(rows)
     (other,) = (episode_id for episode_id, name in names.items() if name == "other")
-    spoil_rlds(data, names)
+    spoil_rlds(data, rows, names)
     index = {names[row["episode_id"]]: row["lerobot_episode_index"] for row in rows if row["kept"]}
     spoil_lerobot(data / "lerobot" / "tiny", index)
     spoil_manifest(data, rows, other)

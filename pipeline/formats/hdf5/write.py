@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from pipeline.episode_schema import SCHEMA, Content, check, labels_of
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.hdf5 import layout
-from pipeline.images.jpeg import decode, to_policy
+from pipeline.images.jpeg import decode, decode_exactly, to_policy
 from pipeline.libero import hdf5
 from pipeline.types import Episode, Replay
 
@@ -76,18 +75,13 @@ def _images(episode: Episode, content: Content) -> dict[str, NDArray[Any]]:
         arrays[layout.frames_key(view)] = np.stack([to_policy(decode(file)) for file in files])
     for view, geometry in episode.geometry.items():
         for name in content.maps:
-            maps = [to_policy(_decoded_exactly(file)) for file in geometry.maps[name]]
+            maps = [to_policy(decode_exactly(file)) for file in geometry.maps[name]]
             arrays[layout.maps_key(view, name)] = np.stack(maps)[..., None]
         if geometry.boxes is not None:
             arrays[layout.maps_key(view, "boxes")] = layout.boxes_turned_back(geometry.boxes, content.size_px)
     if episode.object_poses is not None:
         arrays[layout.OBJECT_POSES] = episode.object_poses
     return {name.removeprefix("obs/"): values for name, values in arrays.items()}
-
-
-def _decoded_exactly(file: bytes) -> NDArray[Any]:
-    """Decode a PNG file to numbers (H, W) of its own type."""
-    return np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED))
 
 
 def _attributes(episode: Episode, content: Content) -> dict[str, Any]:

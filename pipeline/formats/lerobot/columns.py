@@ -102,8 +102,8 @@ def camera_column(view: str, name: str) -> str:
     """Return the column with a view's matrix, map or boxes.
 
     A matrix is stored row by row in ``meta/provenance.parquet``, a map as PNG in base64 in every frame, and boxes as
-    numbers, row by row, in every frame. Maps are text,
-    and no name begins with ``observation``, because lerobot's policies use such columns and all images as inputs.
+    numbers, row by row, in every frame. Maps are text, and no name begins with ``observation``, because lerobot's
+    policies use such columns and all images as inputs.
     """
     return f"{ALL_VIEWS[view].lerobot_camera}.{name}"
 

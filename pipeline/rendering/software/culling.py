@@ -15,7 +15,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import SIZE_PX
 from pipeline.rendering.software.mujoco_3_2_7.passes import REFLECTING_SQUARE, WIDEST_MAP_DEG
 from pipeline.rendering.software.samples import Projection
 from pipeline.types import Floats
@@ -80,7 +79,7 @@ class Culling:
         shown: (ngeom,) geoms that are not in a hidden group.
     """
 
-    def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int], size_px: int = SIZE_PX):
+    def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int], size_px: int):
         self._model, self._size_px = model, size_px
         self.shown = ~np.isin(model.geom_group, list(hidden_groups))
         self._planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
@@ -229,19 +228,18 @@ class _View:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, size_px: int):
         number = model.camera(camera).id
         self.position_m, self._axes = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
-        tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
-        # Tangents of half the angles of view, to the side and up.
-        self._tangents = tangent, tangent
-        self._size_px = size_px, size_px
+        # Tangent of half the angle of view, to the side and up.
+        self._tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
+        self._size_px = size_px
         self._depths_m = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent
 
     def projection(self) -> Projection:
         """Return the projection from the world to the picture."""
-        half_px = np.array(self._size_px) / 2
-        focal_px = half_px[1] / self._tangents[1]
-        onto = np.array([[focal_px, 0, -half_px[0]], [0, focal_px, -half_px[1]], [0, 0, -1]])
+        half_px = self._size_px / 2
+        focal_px = half_px / self._tangent
+        onto = np.array([[focal_px, 0, -half_px], [0, focal_px, -half_px], [0, 0, -1]])
         matrix = onto @ np.column_stack([self._axes.T, -self._axes.T @ self.position_m])
-        return Projection(matrix, *self._depths_m, self._size_px)
+        return Projection(matrix, *self._depths_m, (self._size_px, self._size_px))
 
     def shows(self, corners_m: Floats, margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Return a mask (N,) of the hulls of ``corners_m`` (N, K, 3) that may be in the picture.
@@ -252,10 +250,10 @@ class _View:
         """
         right, up, back = np.moveaxis((corners_m - self.position_m) @ self._axes, -1, 0)
         inside = np.ones(len(corners_m), np.bool_)
-        for off_axis, tangent in ((right, self._tangents[0]), (up, self._tangents[1])):
+        for off_axis in (right, up):
             # A box is outside when all of it is beyond one side; the sides pass through the camera.
-            inside &= ~(off_axis + tangent * back > margin_m).all(axis=1)
-            inside &= ~(off_axis - tangent * back < -margin_m).all(axis=1)
+            inside &= ~(off_axis + self._tangent * back > margin_m).all(axis=1)
+            inside &= ~(off_axis - self._tangent * back < -margin_m).all(axis=1)
         return inside
 
     def shows_through(self, corners_m: Floats, opening_m: Floats) -> NDArray[np.bool_]:

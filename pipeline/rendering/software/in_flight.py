@@ -30,12 +30,12 @@ class PixelBuffers:
     """
 
     def __init__(self, context: mujoco.MjrContext, count: int, size_px: int):
-        self._context, self._height, self._width = context, size_px, size_px
+        self._context, self._size_px = context, size_px
         opengl = calls()
         self._buffers: list[int] = np.atleast_1d(opengl.glGenBuffers(count)).tolist()
         for buffer in self._buffers:
             opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, buffer)
-            size = 4 * self._height * self._width
+            size = 4 * self._size_px**2
             opengl.glBufferData(opengl.GL_PIXEL_PACK_BUFFER, size, None, opengl.GL_STREAM_READ)
         opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, 0)
         self._waiting: dict[int, Frame | None] = {}
@@ -52,7 +52,7 @@ class PixelBuffers:
         if oldest in self._waiting and self._waiting[oldest] is None:
             self._waiting[oldest] = self._read(oldest)
         opengl, context = calls(), self._context
-        corners = 0, 0, self._width, self._height
+        corners = 0, 0, self._size_px, self._size_px
         source = context.offFBO
         if context.offSamples:
             source = context.offFBO_r
@@ -77,7 +77,7 @@ class PixelBuffers:
 
     def _read(self, number: int) -> Frame:
         opengl = calls()
-        pixels = np.empty((self._height, self._width, 4), np.uint8)
+        pixels = np.empty((self._size_px, self._size_px, 4), np.uint8)
         opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, self._buffers[number % len(self._buffers)])
         opengl.glGetBufferSubData(opengl.GL_PIXEL_PACK_BUFFER, 0, pixels.nbytes, pixels)
         opengl.glBindBuffer(opengl.GL_PIXEL_PACK_BUFFER, 0)
