@@ -88,10 +88,18 @@ def test_rlds_features_are_openvlas(written: Written) -> None:
     }
     assert observation["image"].encoding_format == "jpeg"
     matrices = {f"{view}_{name}": shape for view in SCHEMA.views for name, shape in MATRICES.items()}
-    assert set(features["episode_metadata"]) == {"file_path", *matrices, *SCHEMA.provenance}
+    assert set(features["episode_metadata"]) == {
+        "file_path",
+        *matrices,
+        *SCHEMA.provenance,
+        "subtask_starts",
+        "subtask_texts",
+        "rewrites",
+    }
     assert {name: features["episode_metadata"][name].shape for name in matrices} == matrices
     assert {name for name, of in features["episode_metadata"].items() if of.np_dtype == np.int64} == {
         "seed",
+        "subtask_starts",
         "touched_steps",
     }
     leaves = [*features["steps"].feature.items(), *observation.items(), *features["episode_metadata"].items()]

@@ -76,7 +76,7 @@ def test_identical_from_the_manifest_and_the_demonstration(copy: Path, short_dem
 def test_says_what_differs(copy: Path, short_demos: Path, tmp_path: Path) -> None:
     row = perturbed(copy)
     changed(copy, {"mujoco_version": "3.3.0", "gl_device": "another"})
-    # The dataset's instruction, of the same length: nothing else in the record moves.
+    # The dataset's instruction, of the same length, wherever the record has it: in the steps and among the rewrites.
     shard = next((copy / "rlds").rglob(row["rlds_shard"]))
     stored = list(records(shard))
     text = row["instruction"].encode()
@@ -87,7 +87,9 @@ def test_says_what_differs(copy: Path, short_demos: Path, tmp_path: Path) -> Non
     assert found["versions"] == {"mujoco": {"manifest": "3.3.0", "here": row["mujoco_version"]}}
     assert found["gl_device"] == {"manifest": "another", "here": row["gl_device"]}
     steps = row["steps"]
-    assert found["differs"] == {"language_instruction": f"{steps} of {steps} steps, the first at step 0"}
+    differs = found["differs"]
+    assert differs.keys() == {"language_instruction", "episode_metadata/rewrites"}
+    assert differs["language_instruction"] == f"{steps} of {steps} steps, the first at step 0"
 
 
 def test_without_the_dataset_it_is_only_made_and_says_so(
