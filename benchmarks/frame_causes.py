@@ -166,6 +166,14 @@ def _starts(task: str) -> Iterator[Case]:
     clean = frame("3.1.6-goal-agentview")
     moved = cv2.warpAffine(clean, shift, (256, 256), borderMode=cv2.BORDER_REFLECT)
     yield Case("goal: camera shifted", np.asarray(moved, np.uint8), frozenset({"camera_pose"}), task)
+    place = np.zeros((256, 256), np.uint8)
+    place[128:200, 102:162] = 1
+    without = cv2.inpaint(clean, place, 3, cv2.INPAINT_TELEA)
+    yield Case("goal: bowl and plate removed", np.asarray(without, np.uint8), frozenset({"things"}), task)
+    blue, _, red = (channel.astype(int) for channel in cv2.split(clean))
+    wood = (np.arange(256)[:, None] > 140) & (red - blue > 15)
+    table = np.where(wood[..., None], clean * np.array([0.8, 1.0, 0.6]), clean)
+    yield Case("goal: table of another colour", np.asarray(table, np.uint8), frozenset({"colours"}), task)
 
 
 def _further(clean: Image, task: str) -> Iterator[Case]:

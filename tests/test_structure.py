@@ -82,6 +82,7 @@ AXIS_IS_SUBJECT = {
     *("pipeline.scenes.placement", "pipeline.scenes.moving"),
     # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
     *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write"),
+    *("pipeline.formats.lerobot.language", "pipeline.validation.checks"),
     *("pipeline.evaluation.harness", "pipeline.rendering.geometry"),
 }
 """Modules outside of ``axes`` in which a string may be the name of an axis."""

@@ -368,7 +368,7 @@ def _unmatched(found: Found, opened: LastStartFrames) -> Iterator[Finding]:
             "keep LIBERO's camera agentview and its field of view",
         )
         return
-    apart = _things_apart(match, opened)
+    apart, surroundings = _things_apart(match, opened)
     if match.task.name == RAMEKIN and apart and not {COMMON[ROBOT], COMMON[GRIPPER]} & apart.keys():
         yield Finding(
             "mujoco",
@@ -376,7 +376,7 @@ def _unmatched(found: Found, opened: LastStartFrames) -> Iterator[Finding]:
             f"(huggingface/lerobot#4390); no other start fits, {left}",
             PIN,
         )
-    elif apart:
+    elif apart and surroundings <= FITTING:
         yield Finding(
             "things",
             f"the camera is ours ({placed.points} points), but {_listed(apart)} differ. None of LIBERO's initial "
@@ -396,15 +396,23 @@ def _listed(apart: dict[str, float]) -> str:
     return ", ".join(f"{name} ({level:.0f} grey levels)" for name, level in apart.items())
 
 
-def _things_apart(match: Match, opened: LastStartFrames) -> dict[str, float]:
-    """Return the robot and the movable things that differ, with the mean difference of their pixels, largest first."""
+def _things_apart(match: Match, opened: LastStartFrames) -> tuple[dict[str, float], float]:
+    """Find the robot and the movable things that differ, with the mean difference of their pixels, largest first.
+
+    Returns:
+        The things, and the mean difference of the pixels of floor, walls and table.
+    """
     side = len(match.fit.residual)
     things = opened.of(match.task).things(match.start, match.camera)
     apart: dict[str, float] = {}
+    background = np.zeros((side, side), np.bool_)
     for name, pixels in things.items():
         seen = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0
-        if name not in BACKGROUND and seen.sum() >= FEWEST_PX:
+        if name in BACKGROUND:
+            background |= seen
+        elif seen.sum() >= FEWEST_PX:
             level = float(match.fit.residual[seen].mean())
             if level > FITTING:
                 apart[name] = level
-    return dict(sorted(apart.items(), key=lambda item: -item[1]))
+    surroundings = float(match.fit.residual[background].mean()) if background.any() else 0.0
+    return dict(sorted(apart.items(), key=lambda item: -item[1])), surroundings

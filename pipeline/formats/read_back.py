@@ -62,7 +62,8 @@ class Copy:
         decoded: (view, step) to the frame, for ``sampled`` steps, where frames are a video.
         marks: further columns of each step, by the dataset's own names, each (T,).
         place: place of the episode, by the format's columns of the manifest.
-        said: lerobot's language column, the entries of each step; ``None`` where the dataset has no such column.
+        said: lerobot's column of persistent language, the entries of each step; ``None`` where the dataset has none.
+        events: lerobot's column of language events, likewise.
         train: True if the episode is in the training split.
         statistics: statistics of the episode; ``None`` where the dataset states none.
         lossless: True if the frames in ``decoded`` were stored without loss.
@@ -76,6 +77,7 @@ class Copy:
     marks: Mapping[str, NDArray[Any]]
     place: Mapping[str, Any]
     said: Sequence[Sequence[Mapping[str, Any]]] | None = None
+    events: Sequence[Sequence[Mapping[str, Any]]] | None = None
     train: bool = True
     statistics: Statistics | None = None
     lossless: bool = False

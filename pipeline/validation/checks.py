@@ -1,6 +1,6 @@
 """Checks of an episode in all places that store it: each is a small function that yields the errors it finds."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -12,6 +12,7 @@ from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.catalogue.scene_files import portable
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, label_faults, labels_of
+from pipeline.formats.annotations import event_annotations, persistent_annotations
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_depth, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.images.jpeg import decode_exactly
@@ -146,31 +147,43 @@ def _goals(case: Case) -> Iterator[Fault]:
 
 
 def instruction(case: Case) -> Iterator[Fault]:
-    """Check the instruction at every step, and the rewrites and subtasks in a language column."""
+    """Check the instruction at every step, and lerobot's language columns."""
     for copy in case.whole:
         wrong = set(copy.instructions) - {case.row["instruction"]}
         if wrong:
             yield case.finding(copy.dataset, f"instruction {min(wrong)!r}", repr(case.row["instruction"]))
-        expected = _language_entries(case, copy.train)
-        for step, stored in enumerate(copy.said or ()):
-            entries = [(row["role"], row["style"], row["content"], np.float32(row["timestamp"])) for row in stored]
-            if entries != expected:
-                strange = [entry for entry in entries if entry not in expected]
-                lacking = [entry for entry in expected if entry not in entries]
-                yield case.finding(copy.dataset, f"language column of step {step} has {strange}", lacking)
-                break
+        yield from _language(case, copy)
 
 
-def _language_entries(case: Case, train: bool) -> list[tuple[str, str, str, np.float32]]:
-    """List the entries of lerobot's language column: the rewrites, in the training split only, and the subtasks."""
-    rewrites = case.made.rewrites if train else ()
-    entries: list[tuple[str, str, str, np.float32]] = []
-    if rewrites:
-        texts = dict.fromkeys([case.row["instruction"], *rewrites])
-        entries += [("user", "task_aug", text, np.float32(0)) for text in texts]
-    for subtask in case.made.subtasks:
-        entries.append(("assistant", "subtask", subtask.text, np.float32(subtask.step / SCHEMA.fps_hz)))
-    return entries
+def _language(case: Case, copy: Copy) -> Iterator[Fault]:
+    """Check the entries of the language columns, at the first step of each column that has others."""
+    persistent = persistent_annotations(case.made, train=copy.train)
+    expected = [(note.role, note.style, note.text, note.time_s, note.camera) for note in persistent]
+    for step, stored in enumerate(copy.said or ()):
+        entries = [(*_spoken(row), np.float32(row["timestamp"]), row["camera"]) for row in stored]
+        if entries != expected:
+            yield _other_entries(case, copy, f"language column of step {step}", entries, expected)
+            break
+    if copy.events is None:
+        return
+    size_px = next(iter(case.stored["image"].frames.values())).shape[0]
+    traces = event_annotations(case.made, size_px)
+    for step, stored in enumerate(copy.events):
+        shown = [(*_spoken(row), row["camera"]) for row in stored]
+        here = [(note.role, note.style, note.text, note.camera) for note in traces if note.step == step]
+        if shown != here:
+            yield _other_entries(case, copy, f"language events of step {step}", shown, here)
+            break
+
+
+def _spoken(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    return row["role"], row["style"], row["content"]
+
+
+def _other_entries(case: Case, copy: Copy, place: str, entries: Sequence[Any], expected: Sequence[Any]) -> Fault:
+    strange = [entry for entry in entries if entry not in expected]
+    lacking = [entry for entry in expected if entry not in entries]
+    return case.finding(copy.dataset, f"{place} has {strange}", lacking)
 
 
 def labels(case: Case) -> Iterator[Fault]:

@@ -311,7 +311,9 @@ def test_run_goes_on_after_it_was_stopped_and_what_is_finished_stays(ablation: A
     assert ablation.left == [], "none goes on unseen"
     done = ablation.done
     assert done.returncode == 0, done.stdout + done.stderr
-    assert re.findall(rf"^\[\d+/{len(stages.STAGES)}\] (\w+)(?:: up to date)?$", done.stdout, re.MULTILINE) == [*stages.STAGES]
+    assert re.findall(rf"^\[\d+/{len(stages.STAGES)}\] (\w+)(?:: up to date)?$", done.stdout, re.MULTILINE) == [
+        *stages.STAGES
+    ]
     assert {file: edition(file) for file in ablation.finished} == ablation.finished
 
 

@@ -1,4 +1,4 @@
-"""lerobot's language column: as lerobot 0.6.1 defines it, and where that is installed, as it reads it."""
+"""lerobot's language columns: as lerobot 0.6.1 defines them, and where that is installed, as it reads them."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, read
 from pipeline.formats.lerobot.columns import Convention
 from pipeline.run.export import export
-from pipeline.types import Episode
+from pipeline.types import Episode, Geometry
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 
@@ -32,8 +32,25 @@ LEROBOT = Version(version("lerobot"))
 TEXTS = pa.list_(pa.string())
 
 
+CAMERA = "observation.images.image"
+
+
 def told(episode_id: str) -> Episode:
-    return replace(episode(episode_id), rewrites=REWRITES, subtasks=SUBTASKS)
+    """Return an episode whose hand goes from the middle of the picture to the right, 1 m in front of the camera."""
+    made = episode(episode_id)
+    state = made.state.copy()
+    state[:, :3] = [0.0, 0.0, 1.0]
+    state[:, 0] += 0.01 * np.arange(len(made))
+    intrinsics = np.array([[100, 0, 128], [0, 100, 128], [0, 0, 1]], np.float32)
+    seen = Geometry(intrinsics, np.eye(4, dtype=np.float32))
+    geometry = {"image": seen, "wrist_image": seen}
+    return replace(made, state=state, geometry=geometry, rewrites=REWRITES, subtasks=SUBTASKS)
+
+
+def trace(step: int, steps: int) -> str:
+    """Return the trace of ``told`` that begins at a step of an episode."""
+    points = [[128 + step + later, 128] for later in range(0, steps - step, 4)]
+    return json.dumps({"label": "gripper", "point_format": "xy", "points": points})
 
 
 @pytest.fixture(scope="module")
@@ -56,27 +73,24 @@ def rows(root: Path) -> list[dict[str, Any]]:
 
 
 def test_the_column_is_lerobots(root: Path) -> None:
-    """``language_feature_info`` and ``language_persistent_column_feature`` of ``lerobot/datasets/language.py`` in
-    0.6.1, as ``datasets`` writes that in Arrow."""
+    """``language_feature_info``, ``language_persistent_column_feature`` and ``language_events_column_feature`` of
+    ``lerobot/datasets/language.py`` in 0.6.1, as ``datasets`` writes that in Arrow."""
     info = json.loads((root / "meta" / "info.json").read_text())
-    assert info["features"]["language_persistent"] == {"dtype": "language", "shape": [1], "names": None}
     text = pa.string()
-    row = pa.struct(
-        [
-            ("role", text),
-            ("content", text),
-            ("style", text),
-            ("timestamp", pa.float32()),
-            ("camera", text),
-            ("tool_calls", pa.list_(pa.json_())),
-        ]
-    )
-    for file in (root / "data").rglob("*.parquet"):
-        schema = pq.read_schema(file)
-        assert schema.field("language_persistent").type == pa.list_(row)
-        stored = datasets.Features.from_arrow_schema(schema)["language_persistent"]
-        assert stored.feature["tool_calls"] == datasets.List(datasets.Json())
-    assert "language_persistent" not in json.loads((root / "meta" / "stats.json").read_text())
+    note = [("role", text), ("content", text), ("style", text)]
+    source = [("camera", text), ("tool_calls", pa.list_(pa.json_()))]
+    columns = {
+        "language_persistent": pa.struct([*note, ("timestamp", pa.float32()), *source]),
+        "language_events": pa.struct([*note, *source]),
+    }
+    for name, row in columns.items():
+        assert info["features"][name] == {"dtype": "language", "shape": [1], "names": None}
+        for file in (root / "data").rglob("*.parquet"):
+            schema = pq.read_schema(file)
+            assert schema.field(name).type == pa.list_(row)
+            stored = datasets.Features.from_arrow_schema(schema)[name]
+            assert stored.feature["tool_calls"] == datasets.List(datasets.Json())
+        assert name not in json.loads((root / "meta" / "stats.json").read_text())
 
 
 def test_every_frame_has_the_rewrites_and_subtasks_of_its_episode(root: Path) -> None:
@@ -96,13 +110,23 @@ def test_every_frame_has_the_rewrites_and_subtasks_of_its_episode(root: Path) ->
         expected = (source.instruction, *REWRITES) if row["episode_index"] < train else ()
         assert [each["content"] for each in wordings] == list(expected)
         assert {(each["role"], each["timestamp"]) for each in wordings} <= {("user", 0.0)}
-        assert len(said) == len(subtasks) + len(wordings)
+        motions = [(each["role"], each["content"], each["timestamp"]) for each in said if each["style"] == "motion"]
+        # The hand of every tenth step turns anew, and its fingers close at step 6.
+        assert [round(at_s * 20) for _, _, at_s in motions] == [0, 10][: 1 + (len(source) > 10)]
+        assert {role for role, _, _ in motions} == {"assistant"}
+        assert motions[0][1].startswith("move forward, ")
+        assert motions[0][1].endswith(", close the gripper")
+        assert len(said) == len(subtasks) + len(wordings) + len(motions)
+        shown = [(each["role"], each["style"], each["camera"], each["content"]) for each in row["language_events"]]
+        step = row["frame_index"]
+        begins = step % 10 == 0 and step + 4 < len(source)
+        assert shown == ([("assistant", "trace", CAMERA, trace(step, len(source)))] if begins else [])
 
 
 Said = list[list[dict[str, Any]]]
 
 
-def lose_a_subtask(said: Said) -> None:
+def lose_an_entry(said: Said) -> None:
     said[5].pop()
 
 
@@ -118,6 +142,10 @@ def change_the_speaker(said: Said) -> None:
     said[3][0]["role"] = "assistant"
 
 
+def name_a_camera(said: Said) -> None:
+    said[4][0]["camera"] = CAMERA
+
+
 def say_nothing(said: Said) -> None:
     said[7].clear()
 
@@ -129,21 +157,40 @@ def reword_what_is_held_out(said: Said) -> None:
 def keep(said: Said) -> None: ...
 
 
+def move_to_the_next_frame(events: Said) -> None:
+    events[1].append(events[0].pop())
+
+
+def show_another_view(events: Said) -> None:
+    events[0][0]["camera"] = "observation.images.image2"
+
+
+def shift_a_point(events: Said) -> None:
+    events[10][0]["content"] = events[10][0]["content"].replace("[138, 128]", "[139, 128]")
+
+
+PERSISTENT, EVENTS = "language_persistent", "language_events"
+
+
 @pytest.mark.parametrize(
-    ("episode_index", "plant", "at"),
+    ("column", "episode_index", "plant", "at"),
     [
-        (0, keep, None),
-        (4, keep, None),
-        (0, lose_a_subtask, 5),
-        (0, reword, 0),
-        (0, be_late, -1),
-        (0, change_the_speaker, 3),
-        (4, say_nothing, 7),
-        (4, reword_what_is_held_out, 2),
+        (PERSISTENT, 0, keep, None),
+        (PERSISTENT, 4, keep, None),
+        (PERSISTENT, 0, lose_an_entry, 5),
+        (PERSISTENT, 0, reword, 0),
+        (PERSISTENT, 0, be_late, -1),
+        (PERSISTENT, 0, change_the_speaker, 3),
+        (PERSISTENT, 0, name_a_camera, 4),
+        (PERSISTENT, 4, say_nothing, 7),
+        (PERSISTENT, 4, reword_what_is_held_out, 2),
+        (EVENTS, 0, move_to_the_next_frame, 0),
+        (EVENTS, 0, show_another_view, 0),
+        (EVENTS, 4, shift_a_point, 10),
     ],
 )
 def test_what_validate_does_not_expect_in_it_is_found(
-    root: Path, tmp_path: Path, episode_index: int, plant: Callable[[Said], None], at: int | None
+    root: Path, tmp_path: Path, column: str, episode_index: int, plant: Callable[[Said], None], at: int | None
 ) -> None:
     shutil.copytree(root, tmp_path / NAME)
     file, first = next(
@@ -152,9 +199,9 @@ def test_what_validate_does_not_expect_in_it_is_found(
         if episode_index in (table := pq.read_table(file))["episode_index"].to_pylist()
     )
     made = told(table["episode_id"][first].as_py())
-    said = table["language_persistent"].to_pylist()
+    said = table[column].to_pylist()
     plant(part := said[first : first + len(made)])
-    place = table.schema.get_field_index("language_persistent")
+    place = table.schema.get_field_index(column)
     field = table.schema.field(place)
     # pyarrow makes no JSON from Python.
     entry = [one.with_type(TEXTS) if one.name == "tool_calls" else one for one in field.type.value_type]
@@ -164,7 +211,8 @@ def test_what_validate_does_not_expect_in_it_is_found(
     assert copy is not None
     no_replay: Any = None
     found = CHECKS["instruction"](Case({"instruction": made.instruction}, made, no_replay, [copy], None))
-    expected = [] if at is None else [f"language column of step {at % len(made)}"]
+    name = "language events" if column == EVENTS else "language column"
+    expected = [] if at is None else [f"{name} of step {at % len(made)}"]
     assert [fault.what.split(" has ")[0] for fault in found] == expected
 
 
@@ -172,7 +220,7 @@ def test_without_it_no_frame_has_the_column(tmp_path: Path) -> None:
     plain = write_lerobot(tmp_path / "plain")
     assert "language" not in LeRobotConfig().model_dump()
     (file, *_) = (plain.root / "data").rglob("*.parquet")
-    assert "language_persistent" not in pq.read_schema(file).names
+    assert [name for name in pq.read_schema(file).names if name.startswith("language")] == []
 
 
 # lerobot has language columns from 0.6 on.
@@ -185,6 +233,28 @@ if Version("0.6") > LEROBOT:
             load(file)
 
 else:
+
+    def test_lerobot_finds_the_motion_and_the_trace(root: Path) -> None:
+        from lerobot.datasets.language import column_for_style, language_events_column_feature, validate_camera_field
+        from lerobot.datasets.language_render import active_at, emitted_at
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        data = LeRobotDataset(root.name, root=root, video_backend="pyav")
+        assert data.hf_dataset.features["language_events"] == language_events_column_feature()
+        for index in range(len(data)):
+            item = data[index]
+            said, events, at_s = item["language_persistent"], item["language_events"], float(item["timestamp"])
+            for name in ("language_persistent", "language_events"):
+                for row in item[name]:
+                    assert column_for_style(row["style"]) == name
+                    validate_camera_field(row["style"], row["camera"])
+            begun = [row for row in said if row["style"] == "motion" and row["timestamp"] <= at_s]
+            assert active_at(at_s, persistent=said, style="motion") == begun[-1]
+            found = emitted_at(at_s, persistent=said, events=events, style="trace", camera=CAMERA)
+            step = int(item["frame_index"])
+            source = told(item["episode_id"])
+            begins = step % 10 == 0 and step + 4 < len(source)
+            assert (found and found["content"]) == (trace(step, len(source)) if begins else None)
 
     def test_lerobot_renders_a_rewrite_and_the_active_subtask(root: Path) -> None:
         from lerobot.configs.recipe import MessageTurn, TrainingRecipe

@@ -1,5 +1,6 @@
 """Cameras, depth, segmentation and poses: what the datasets have of them leads from a pixel to the thing it shows."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,6 +24,7 @@ from pipeline.axes.light import LightPerturbation
 from pipeline.compute.pool import loop
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
+from pipeline.formats.annotations import TRACE_STEPS, event_annotations
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.libero import bddl
 from pipeline.planning import plan, selection
@@ -240,6 +242,20 @@ def test_both_datasets_have_what_the_store_has(run: Path) -> None:
     )
     assert not np.array_equal(moved["image"].extrinsics, clean["image"].extrinsics)
     assert moved["wrist_image"].maps == clean["wrist_image"].maps
+
+
+def test_the_traces_go_through_the_pixels_of_the_gripper(run: Path) -> None:
+    """By the boxes around its mask, which the renderer's ids give."""
+    compared = 0
+    for case in cases(run):
+        boxes = case.made.geometry["image"].boxes
+        assert boxes is not None
+        for note in event_annotations(case.made, 256):
+            for k, (x, y) in enumerate(json.loads(note.text)["points"]):
+                left, top, width, height = boxes[note.step + k * TRACE_STEPS, case.made.instances.index("gripper")]
+                assert (left <= x < left + width, top <= y < top + height) == (True, True)
+                compared += 1
+    assert compared > 5
 
 
 def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:

@@ -45,8 +45,8 @@ class LeRobotConfig(FormatOptions):
             0.5; 0 by default.
         action: Content of the column ``action``, on which policies train: ``delta``, the controller's input, or
             ``absolute``, its goal; ``delta`` by default. The other one is in ``absolute_action`` or ``delta_action``.
-        language: True adds the task's rewrites and the current subtask to every frame, in lerobot's language column;
-            false by default. Versions of lerobot before 0.6 cannot read such a dataset.
+        language: True adds rewrites, subtasks, motions and traces in lerobot's language columns; false by default.
+            Versions of lerobot before 0.6 cannot read such a dataset.
         depth: Storage of the extra ``depth``: ``text`` is its PNG files in base64, ``video`` is lerobot's own depth in
             codes of 12 bits; ``text`` by default. Versions of lerobot before 0.6 cannot read ``video``.
     """
@@ -109,7 +109,7 @@ class LeRobot(Format[LeRobotConfig]):
     title: ClassVar = "LeRobot"
     options_type: ClassVar = LeRobotConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 10
+    recipe: ClassVar = 11
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     held_out_place: ClassVar = (
         "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless it is restricted "

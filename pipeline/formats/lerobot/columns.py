@@ -44,6 +44,9 @@ IN_TEXT = 1.2
 LANGUAGE = "language_persistent"
 """lerobot's column of an episode's language annotations, all of them in every frame, from lerobot 0.6 on."""
 
+EVENTS = "language_events"
+"""lerobot's column of the annotations that begin at a frame, from lerobot 0.6 on."""
+
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """lerobot's own columns of every frame, in addition to ``timestamp``."""
 
@@ -152,7 +155,7 @@ class Convention:
         names: column of v3.0 to its name here, where the names differ.
         open_is_one: True if the gripper's command is 1 open, 0 closed, instead of LIBERO's. GR00T and starVLA, which
             read ``meta/modality.json``, expect it.
-        language: True if the set has lerobot's language column.
+        language: True if the set has lerobot's language columns.
         action: content of the column ``action``.
         depth: storage of the depth maps, if the content has them.
     """
@@ -234,7 +237,7 @@ class Convention:
         if "object_poses" in content.extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
         if self.language:
-            columns[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
+            columns |= {name: {"dtype": "language", "shape": (1,), "names": None} for name in (LANGUAGE, EVENTS)}
         columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}
         columns |= {name: dict(number) for name in COUNTERS}
         return {self.name(column): description for column, description in columns.items()}

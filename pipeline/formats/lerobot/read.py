@@ -21,6 +21,7 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.lerobot.columns import (
     EPISODE_ID,
+    EVENTS,
     INSTANCES,
     LANGUAGE,
     OBJECT_POSES,
@@ -137,6 +138,7 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
         marks={name: table[name].to_numpy() for name in MARKS},
         place={"lerobot_episode_index": index},
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
+        events=table[EVENTS].to_pylist() if EVENTS in table.column_names else None,
         train=index < int(info["splits"]["train"].partition(":")[2]),
         statistics=Statistics(
             stored=_statistics(root, row),

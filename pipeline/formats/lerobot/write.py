@@ -48,7 +48,6 @@ from pipeline.formats.lerobot.columns import (
     FILE_MB,
     FILES_OF_A_CHUNK,
     INSTANCES,
-    LANGUAGE,
     OBJECT_POSES,
     PLACE,
     VIDEO_INFO,
@@ -61,6 +60,7 @@ from pipeline.formats.lerobot.columns import (
     read_matrix,
     video_path_v21,
 )
+from pipeline.formats.lerobot.language import FEATURES, language_columns
 from pipeline.images.jpeg import decode, decode_exactly
 from pipeline.types import Episode, Frame
 
@@ -87,19 +87,6 @@ INDEX = (
 
 Numbers = Mapping[str, NDArray[Any]]
 """Column to its values at each step, (T,) or (T, D)."""
-
-_TEXT = datasets.Value("string")
-_LANGUAGE_TYPE = datasets.List(
-    {
-        "role": _TEXT,
-        "content": _TEXT,
-        "style": _TEXT,
-        "timestamp": datasets.Value("float32"),
-        "camera": _TEXT,
-        "tool_calls": datasets.List(datasets.Json()),
-    }
-)
-"""``language_persistent_column_feature`` in ``datasets/language.py`` of lerobot 0.6.1; older versions lack it."""
 
 
 class Video:
@@ -202,7 +189,7 @@ def _data_schema(columns: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
         if dtype == "image":
             stored[name] = datasets.Image()
         elif dtype == "language":
-            stored[name] = _LANGUAGE_TYPE
+            stored[name] = FEATURES[name]
         elif dtype != "video":
             value = datasets.Value(dtype)
             stored[name] = value if shape == (1,) else datasets.Sequence(value, length=shape[0])
@@ -280,27 +267,6 @@ def _step_columns(episode: Episode, found: Numbers, convention: Convention, cont
         else:
             stored[name] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
     return stored | {name: pa.array(values) for name, values in texts.items()} | images
-
-
-def _language_column(episode: Episode, train: bool) -> dict[str, pa.Array]:
-    """Return the language column of an episode, identical in each of its frames, as in lerobot's own annotations.
-
-    ``active_at`` of lerobot's ``language_render.py`` finds the subtask by its time. ``task_aug`` is for training alone;
-    its first entry is the episode's own instruction.
-    """
-    annotations = []
-    if train and episode.rewrites:
-        wordings = dict.fromkeys([episode.instruction, *episode.rewrites])
-        annotations += [("user", "task_aug", 0, text) for text in wordings]
-    annotations += [("assistant", "subtask", step, text) for step, text in episode.subtasks]
-    rows = []
-    for role, style, step, text in annotations:
-        rows.append({"role": role, "content": text, "style": style, "timestamp": np.float32(step / SCHEMA.fps_hz)})
-    # pyarrow creates no JSON from Python objects; casting the table to the schema creates it from text.
-    kinds = {name: pa.string() for name in ("role", "content", "style", "camera")}
-    kinds |= {"timestamp": pa.float32(), "tool_calls": pa.list_(pa.string())}
-    once = pa.array([rows], pa.list_(pa.struct([(name, kinds[name]) for name in _LANGUAGE_TYPE.feature])))
-    return {LANGUAGE: pa.concat_arrays([once] * len(episode))}
 
 
 def _picture_statistics(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
@@ -478,7 +444,7 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, co
                 levels[f"{view}_depth"] = _append_depth(episode, view, video)
             columns = _step_columns(episode, numbers, convention, content)
             if convention.language:
-                columns |= _language_column(episode, piece.split == "train")
+                columns |= language_columns(episode, content.size_px, train=piece.split == "train")
             # Each episode is a row group of its own, so that it can be read alone.
             table = pa.table({name: columns[name] for name in data.schema.names})
             data.write_table(table.cast(data.schema))
