@@ -15,6 +15,7 @@ minutes of CPU.
 import argparse
 import json
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
@@ -25,9 +26,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.axes import task_of
 from pipeline.formats.hdf5.layout import START_STATE
 from pipeline.formats.hdf5.read import start_of
 from pipeline.libero import hdf5
+from pipeline.libero.carried import bddl_text
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
@@ -85,7 +88,7 @@ def of_run(folder: Path) -> Iterator[Done]:
         trajectory = store.load(row.trajectory_id)
         # Episodes that change no physics share the clean twin's trajectory.
         what = row.component if trajectory.resolved != "{}" else "clean"
-        task = find_task(row.suite, row.task)
+        task = task_of(row.suite, row.task, row.perturbations)
         yield Done(task, what, row.trajectory_id, trajectory.scene, trajectory.states, trajectory.actions)
 
 
@@ -113,14 +116,17 @@ def opened(task: Task) -> Any:
     from libero.libero.envs.env_wrapper import ControlEnv
     from robosuite.utils.errors import RandomizationError
 
-    while True:
-        with suppress(RandomizationError):
-            return ControlEnv(
-                bddl_file_name=str(task.bddl_file),
-                has_offscreen_renderer=False,
-                use_camera_obs=False,
-                ignore_done=True,
-            )
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / task.bddl_file.name
+        file.write_text(bddl_text(task))
+        while True:
+            with suppress(RandomizationError):
+                return ControlEnv(
+                    bddl_file_name=str(file),
+                    has_offscreen_renderer=False,
+                    use_camera_obs=False,
+                    ignore_done=True,
+                )
 
 
 def repeated(env: Any, done: Done) -> str | None:

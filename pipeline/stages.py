@@ -225,7 +225,7 @@ def write_manifest(run: Run) -> None:
         registry.places(run.formats),
         registry.columns(),
         config.export.where,
-        lambda row: export.wordings(config.plan.axes.language, row.suite, row.task, row.axis),
+        lambda row: export.wordings(config.plan.axes.language, row.suite, row.task, row.perturbations),
     )
     manifest.write(table, run.manifest_file, manifest.Settings.of(config))
 

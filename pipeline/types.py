@@ -94,12 +94,15 @@ class Task:
         name: LIBERO's task name, the stem of its BDDL file.
         instruction: the wording of LIBERO's task list, with which policies are prompted.
         bddl_file: the file that defines the scene and the goal.
+        goal_file: another file that defines the goal, of a task that is carried to the scene of ``bddl_file``
+            (``pipeline.libero.carried``); ``None`` for all tasks of LIBERO and of the user.
     """
 
     suite: str
     name: str
     instruction: str
     bddl_file: Path
+    goal_file: Path | None = None
 
     def __str__(self) -> str:
         return f"{self.suite}/{self.name}"

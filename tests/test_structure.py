@@ -78,12 +78,15 @@ AXIS_IS_SUBJECT = {
     # The benchmark's files and the paper's table, which name the dimensions of the test tasks.
     *("pipeline.testset.definitions", "pipeline.testset.own_tasks"),
     *("pipeline.evaluation.libero_plus", "pipeline.evaluation.other_programs", "pipeline.report.paper_table"),
+    # Evaluation tasks that ask for another goal of a scene.
+    *("pipeline.evaluation.tasks", "pipeline.evaluation.selection"),
     # What two axes do to a scene, which sampling a plan must not load.
     *("pipeline.scenes.placement", "pipeline.scenes.moving"),
     # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
     *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write"),
     *("pipeline.formats.lerobot.language", "pipeline.validation.checks"),
     *("pipeline.evaluation.harness", "pipeline.rendering.geometry"),
+    *("pipeline.rewriting.rewrite", "pipeline.report.paper_rows"),
 }
 """Modules outside of ``axes`` in which a string may be the name of an axis."""
 

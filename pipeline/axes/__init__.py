@@ -18,6 +18,7 @@ from pipeline.axes.base import RenderPerturbation as RenderPerturbation
 from pipeline.axes.base import TextPerturbation as TextPerturbation
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.disturbance import DisturbanceAxis
+from pipeline.axes.goal import GoalAxis
 from pipeline.axes.language import LanguageAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.axes.light import LightAxis
@@ -25,7 +26,9 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.errors import PipelineError
+from pipeline.libero.tasks import find_task
 from pipeline.testset.benchmark import TestTask
+from pipeline.types import Task
 
 
 class Axes(Frozen):
@@ -35,6 +38,7 @@ class Axes(Frozen):
     free places of a demonstration's scene. Then the target and the arm move, and are rejected if they touch an object.
 
     Attributes:
+        goal: Tasks carried out in the scenes of other tasks.
         layout: Objects that are added to the scene.
         pose: Displaced and turned objects of the scene.
         robot: Posture in which the arm starts, or to which the controller pulls it.
@@ -46,6 +50,7 @@ class Axes(Frozen):
         language: Rewrites of the instruction.
     """
 
+    goal: GoalAxis | None = None
     layout: LayoutAxis | None = None
     pose: PoseAxis | None = None
     robot: RobotAxis | None = None
@@ -98,6 +103,18 @@ def axes_of(name: str) -> tuple[str, ...]:
     if len(set(axes)) < len(axes):
         raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
     return tuple(sorted(axes, key=_PLACE.__getitem__))
+
+
+def task_of(suite: str, name: str, perturbations: str) -> Task:
+    """Return the task that an episode carries out: the named one, which a perturbation may carry to another scene.
+
+    Args:
+        perturbations: JSON list, as in the columns of the plan and the manifest.
+    """
+    task = find_task(suite, name)
+    for perturbation in from_json(perturbations):
+        task = perturbation.played(task)
+    return task
 
 
 def level_of_test(tested: TestTask) -> int:

@@ -130,6 +130,15 @@ class Perturbation(Frozen):
         """Return this change with the names that things have in all tasks with the initial scene of ``task``."""
         return self
 
+    def played(self, task: Task) -> Task:
+        """Return the task whose goal and scene an episode of ``task`` has with this change."""
+        return task
+
+    @property
+    def reset_seed(self) -> int | None:
+        """Seed of the reset of LIBERO's environment that starts the episode; ``None`` if it starts as recorded."""
+        return None
+
     def apart(self, others: Sequence[Self]) -> Floats:
         """Return the distances (N,) to N perturbations of this class, in the measure of ``distances``.
 

@@ -235,6 +235,8 @@ def _dealt(
 ) -> tuple[LanguagePerturbation, ...]:
     """List all rewrites of a task in the order of ``deal``; empty if there are none.
 
+    Rewrites that lose their meaning in the scene that a task is carried to are left out.
+
     Raises:
         PipelineError: when one of the rewrites does not pass ``lint``.
     """
@@ -244,16 +246,19 @@ def _dealt(
     dealt: list[LanguagePerturbation] = []
     for row in zip_longest(*columns):
         dealt += [rewrite for rewrite in row if rewrite is not None]
+    keeping: list[LanguagePerturbation] = []
     for rewrite in dealt:
         fault = lint(rewrite.text, task, rewrite.component)
-        if fault:
+        if not fault:
+            keeping.append(rewrite)
+        elif task.goal_file is None:
             raise PipelineError(
                 f"{rewrite.component} rewrite {rewrite.text!r} of {task} is rejected: {fault}",
                 where=bank or BANK_FILE,
                 expected=f"lower-case ASCII, {LENGTH}, no final punctuation, the task's goal",
                 remedy=REMEDY,
             )
-    return tuple(dealt)
+    return tuple(keeping)
 
 
 def _stored(task: Task, bank: Path | None) -> dict[Component, list[str]]:

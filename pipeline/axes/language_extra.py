@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from pipeline.axes.language_goal import Mention, Reading, thing_words, words
-from pipeline.libero.bddl import read
+from pipeline.libero.carried import definition_of
 from pipeline.libero.task_goal import read_goal
 from pipeline.types import Task
 
@@ -64,7 +64,7 @@ def surroundings(task: Task) -> Surroundings:
     Raises:
         PipelineError: when the task's BDDL file cannot be read.
     """
-    goal, bddl = read_goal(task.bddl_file), read(task.bddl_file)
+    goal, bddl = read_goal(task), definition_of(task)
     located = (*goal.aims, *goal.starts)
     things = {aim.thing for aim in located} | {change.thing for change in goal.changes}
     places = {aim.place for aim in located if aim.place}

@@ -312,7 +312,7 @@ def changed_goal(text: str, task: Task, hints: bool) -> str | None:
     Raises:
         PipelineError: when the task's BDDL file cannot be read.
     """
-    reading = Reading(text, read_goal(task.bddl_file).scene, hints)
+    reading = Reading(text, read_goal(task).scene, hints)
     for demand in demands(task):
         if not demand.met(reading):
             return demand.fault
@@ -322,9 +322,24 @@ def changed_goal(text: str, task: Task, hints: bool) -> str | None:
 @cache
 def demands(task: Task) -> tuple[Demand, ...]:
     """List the goal's demands on a rewrite, as far as LIBERO's own wording meets them."""
-    goal = read_goal(task.bddl_file)
+    goal = read_goal(task)
     original = Reading(task.instruction, goal.scene, hints=False)
     return tuple(demand for demand in _of_goal(goal, original) if demand.met(original))
+
+
+def lost_demands(task: Task, played: Task) -> list[str]:
+    """List the faults of the task's own instruction in another scene that it does not have in its own scene.
+
+    Args:
+        played: the task carried to the other scene.
+    """
+    goal = read_goal(played)
+    reading = Reading(task.instruction, goal.scene, hints=False)
+    faults = [demand.fault for demand in _of_goal(goal, reading) if not demand.met(reading)]
+    own = read_goal(task)
+    own_reading = Reading(task.instruction, own.scene, hints=False)
+    own_faults = {demand.fault for demand in _of_goal(own, own_reading) if not demand.met(own_reading)}
+    return [fault for fault in faults if fault not in own_faults]
 
 
 def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:

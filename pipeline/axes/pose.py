@@ -28,8 +28,8 @@ from pipeline.axes.report_data import (
     Scatter,
     Strips,
 )
-from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
+from pipeline.libero.carried import definition_of
 from pipeline.libero.task_goal import relation_holds
 from pipeline.libero.tasks import Same, find_task
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -215,7 +215,7 @@ def _test_shifts(test: TestSet, task: Task) -> list[Shifts]:
 
 def _scene_name(task: Task, thing: str) -> str:
     """Return the name that a task's thing has in every task with the initial scene of ``task``."""
-    return bddl.read(task.bddl_file).scene_names.get(thing, thing)
+    return definition_of(task).scene_names.get(thing, thing)
 
 
 class ScenePerturbation(_PosePerturbation):
@@ -296,7 +296,7 @@ def sample_scene(rng: np.random.Generator, level: Level, task: Task, places_m: S
     Args:
         places_m: displacements of things before those of the disks.
     """
-    definition = bddl.read(task.bddl_file)
+    definition = definition_of(task)
     carriers, centres_m = definition.carriers, definition.centres_m
     radius_m = level * _disk_m(task)
     for _ in range(DRAWS):
@@ -320,7 +320,7 @@ def _benchmark_places_m(task: Task) -> Shifts:
     """Return the displacements of ``BASE_M`` for a task of the goal suite, if the hand can then reach the object."""
     if task.suite != "libero_goal":
         return {}
-    centres_m = bddl.read(task.bddl_file).centres_m
+    centres_m = definition_of(task).centres_m
     places_m = {}
     for name, shift in BASE_M.items():
         if _within_reach(task, name, np.add(centres_m[name], shift)):
@@ -341,7 +341,7 @@ def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
 
     The objects that the task needs must also be within the hand's reach.
     """
-    definition = bddl.read(task.bddl_file)
+    definition = definition_of(task)
     centres_m = definition.centres_m
     alone = [thing for thing, carrier in definition.carriers.items() if thing == carrier]
     for first, second in combinations(alone, 2):
@@ -357,7 +357,7 @@ def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
 
 def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
     """Return whether the hand reaches a thing at ``place_m`` (2,); true if it is no object that the task needs."""
-    definition = bddl.read(task.bddl_file)
+    definition = definition_of(task)
     if thing not in definition.objects or thing not in definition.of_interest:
         return True
     robot_m = (ARENAS[definition.arena].robot_x_m, 0.0)
@@ -398,7 +398,7 @@ class PoseAxis(Axis):
 
     def _choices(self, task: Task) -> list[tuple[Component, str]]:
         """List the components with each thing that they can move; the component ``scene`` moves ``all``."""
-        definition = bddl.read(task.bddl_file)
+        definition = definition_of(task)
         all_places_known = definition.places and definition.centres_m.keys() == definition.places.keys()
         movable: dict[Component, tuple[str, ...]] = {
             "target": definition.targets,
@@ -500,7 +500,7 @@ def _plot_shifts(title: str, tested_m: Sequence[object], shifts_m: Sequence[obje
 
 def _targets_moved(task: Task, shifts: Shifts, level: int) -> Iterator[tuple[str, float]]:
     """Measure the displacements of the objects that a task moves."""
-    for target in bddl.read(task.bddl_file).targets:
+    for target in definition_of(task).targets:
         if target in shifts:
             moved_cm = 100 * float(np.hypot(*shifts[target]))
             yield f"displacement of the target in {task.suite}, level {level} (cm)", moved_cm
@@ -512,7 +512,7 @@ def _to_nearest(test: TestSet, places: _Places) -> Iterator[tuple[str, float]]:
         task = find_task(tested.suite, tested.base)
         tested_shifts = displacements(tested.parameters)
         others = [shifts for name, shifts in places[task] if name != tested.name]
-        for thing in bddl.read(task.bddl_file).things_of_interest:
+        for thing in definition_of(task).things_of_interest:
             if thing not in tested_shifts:
                 continue
             apart_m = [math.dist(tested_shifts[thing], shifts[thing]) for shifts in others if thing in shifts]

@@ -20,7 +20,7 @@ from pipeline.evaluation.policies import VIEWS, Wanted
 from pipeline.evaluation.recordings import demonstration
 from pipeline.evaluation.results import REFUSED
 from pipeline.evaluation.simulator import Picture, Simulator
-from pipeline.evaluation.tasks import EvaluationTask, Prompt, find_replacement, libero_states
+from pipeline.evaluation.tasks import CARRIED, EvaluationTask, Prompt, find_replacement, goal_task, libero_states
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import STEP_LIMITS, SUITES, find_task
 from pipeline.testset import benchmark
@@ -251,7 +251,13 @@ class EpisodeEnvironment:
         self._start(self.settings.fixture_seed, state, libero_plus.posture_rad(test))
 
     def _start_goal(self) -> None:
-        """Start an episode of a LIBERO task with a replaced goal object."""
+        """Start an episode of a LIBERO task with a replaced goal object, or with the goal of another task."""
+        if CARRIED in self.task.name:
+            seed, state = self._initial_state()
+            self._base, _ = goal_task(self.task)
+            self._build(self._base, self.task.base)
+            self._start(seed, state)
+            return
         replacement = find_replacement(self._base, self.task.name)
         self._build_from(replacement.bddl_text(self._base), f"{replacement.old} {replacement.new}")
         self._base = replace(self._base, instruction=replacement.instruction)

@@ -24,7 +24,7 @@ from pipeline.evaluation.results import one_setting
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary
-from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.evaluation.tasks import EvaluationTask, goal_task
 from pipeline.files import write, write_json
 from pipeline.images.mp4 import mp4
 from pipeline.libero.tasks import SUITES, find_task
@@ -70,7 +70,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         raise PipelineError(
             "the replays of demonstrations execute deltas", where="actions", expected="--server or --checkpoint"
         )
-    selected = select(selection, evaluation.archive)
+    selected = _not_trained(select(selection, evaluation.archive), settings.plan)
     check_settings(selection, selected, settings)
     evaluation.check(selected)
     faults: dict[EvaluationTask, str] = {}
@@ -98,6 +98,15 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     if faults:
         raise _without_result([*faults.items()])
     return summarised
+
+
+def _not_trained(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
+    """Leave out goals that a training plan carries to the same scenes, and print their number."""
+    goals = set() if plan is None else own_draws.planned(plan).goals
+    left = [task for task in wanted if task.source != "goals" or goal_task(task)[1] not in goals]
+    if len(left) < len(wanted):
+        print(f"left out, because the plan trains on them: {len(wanted) - len(left)} of {len(wanted)} goals")
+    return left
 
 
 def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
@@ -137,9 +146,11 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
         )
     if settings.plan is not None:
         own_draws.sha256_of(settings.plan)
-        if not any(task.source == "own" for task in wanted):
+        if not any(task.source in ("own", "goals") for task in wanted):
             raise PipelineError(
-                "no task has held-out perturbations to compare with a plan", where="plan", expected="--source own"
+                "no task has held-out perturbations to compare with a plan",
+                where="plan",
+                expected="--source own or --source goals",
             )
     if settings.prompt == "benchmark" and not any(task.source == "libero_plus" for task in wanted):
         raise PipelineError(

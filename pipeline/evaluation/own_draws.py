@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json, to_json
+from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json, task_of, to_json
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import held_out_sight
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
 from pipeline.grouping import grouped
+from pipeline.libero.carried import definition_of
 from pipeline.libero.tasks import find_task, shared
 from pipeline.physics.replay import roll_out
 from pipeline.planning import plan
@@ -167,8 +168,12 @@ class PlannedDraws:
         self._draws: dict[Hashable, list[tuple[Perturbation, str]]] = defaultdict(list)
         self.counts = Counter[str]()
         """Axis to the number of its perturbations."""
+        self.goals: set[Hashable] = set()
+        """Goals of tasks that are carried to other scenes, as ``Bddl.asked``."""
         for row in rows:
-            task = find_task(row.suite, row.task)
+            task = task_of(row.suite, row.task, row.perturbations)
+            if task.goal_file is not None:
+                self.goals.add(definition_of(task).asked)
             for perturbation in from_json(row.perturbations):
                 key = _comparable(perturbation, task)
                 self._draws[key].append((perturbation.in_scene(task), row.episode_id))

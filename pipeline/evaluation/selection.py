@@ -24,7 +24,7 @@ from pipeline.evaluation import libero_plus
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_task
 from pipeline.evaluation.results import REFUSED, EpisodeResult
 from pipeline.evaluation.task_list import read_tasks
-from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task, replacements
+from pipeline.evaluation.tasks import EvaluationTask, balanced, carried_tasks, libero_task, replacements
 from pipeline.libero.tasks import SUITES, find_task, suites, tasks
 from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Task
@@ -190,6 +190,7 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
                     for replacement in replacements(task):
                         name, kind = replacement.name(task, number), replacement.category
                         yield EvaluationTask("goals", task.suite, task.name, name, "goal", kind, 0, number)
+                    yield from carried_tasks(task, number)
                 case "own":
                     kinds = product(selection.axes or OWN_AXES, selection.levels or LEVELS)
                     drawn = (drawn_task(task, axis, level, number, selection.seed) for axis, level in kinds)

@@ -1,16 +1,16 @@
-"""Tasks of an evaluation: their identification, LIBERO's initial states, and replaced goals.
+"""Tasks of an evaluation: their identification, LIBERO's initial states, and other goals in LIBERO's scenes.
 
-A replaced goal asks for another object of a LIBERO scene, which the instruction and the BDDL goal name. A policy that
-has memorised the scene repeats the original task. The scene, the initial states and the predicates are LIBERO's own, so
-LIBERO's environment judges the new goal.
+A replaced goal asks for another object of a LIBERO scene, which the instruction and the BDDL goal name. A carried goal
+is that of another LIBERO task. A policy that has memorised the scene repeats the original task. The scene, the initial
+states and the predicates are LIBERO's own, so LIBERO's environment judges the new goal.
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import zip_longest
 from typing import Annotated, Any, Literal
@@ -20,6 +20,7 @@ from pydantic import BeforeValidator
 
 from pipeline import seeding
 from pipeline.axes.component_names import current_names, stored_names
+from pipeline.axes.goal import held_out, level
 from pipeline.axes.language_goal import found, pattern, thing_words, words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
@@ -27,8 +28,12 @@ from pipeline.grouping import grouped
 from pipeline.libero import bddl
 from pipeline.libero.assets import libero_folder
 from pipeline.libero.bddl import Bddl
-from pipeline.libero.tasks import SUITES, tasks
+from pipeline.libero.carried import carried, definition_of
+from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Floats, Task
+
+CARRIED = "_task_"
+"""Text between the names of a scene's task and of the task whose goal is carried to the scene."""
 
 Source = Literal["libero", "libero_plus", "own", "goals"]
 
@@ -163,6 +168,43 @@ class Replacement:
         text = task.bddl_file.read_text()
         start = text.index("(:goal")
         return text[:start] + re.sub(rf"\b{self.old}\b", self.new, text[start:])
+
+
+def carried_tasks(scene: Task, number: int) -> list[EvaluationTask]:
+    """List the held-out goals of other tasks in the scene of a task, in LIBERO's initial state with a number.
+
+    Goals that a replacement asks for as well are left out.
+    """
+    replaced = {_parsed(replacement.bddl_text(scene), replacement).asked for replacement in replacements(scene)}
+    listed = []
+    for task, place in sorted(held_out(scene.suite), key=str):
+        if place == scene and definition_of(carried(task, scene)).asked not in replaced:
+            name = f"{scene.name}{CARRIED}{task.name}_state{number}"
+            strength = level(task, scene)
+            listed.append(
+                EvaluationTask("goals", task.suite, scene.name, name, "goal", "other_scene", strength, number)
+            )
+    return listed
+
+
+def _parsed(text: str, replacement: Replacement) -> Bddl:
+    return bddl.parse(text, str(replacement))
+
+
+def goal_task(task: EvaluationTask) -> tuple[Task, Hashable]:
+    """Return the LIBERO task of an evaluation task of the source ``goals``, and the goal that it asks for in its scene.
+
+    Raises:
+        PipelineError: if there is no such goal.
+    """
+    base = find_task(task.suite, task.base)
+    if CARRIED in task.name:
+        asked = task.name.removeprefix(task.base + CARRIED).rpartition("_state")[0]
+        base = carried(find_task(task.suite, asked), base)
+        return base, definition_of(base).asked
+    replacement = find_replacement(base, task.name)
+    definition = _parsed(replacement.bddl_text(base), replacement)
+    return replace(base, instruction=replacement.instruction), definition.asked
 
 
 WHICH = r".*?(?= and (?:place|put)\b)| (?:at|on|in) the (?:back|front|left|middle|right)(?! of)\b"

@@ -93,6 +93,19 @@ class Bddl:
             names[thing] = f"{spot} #{counts[spot]}"
         return names
 
+    @property
+    def asked(self) -> Hashable:
+        """The goal in its scene; equal for two tasks if one goal is to be reached in one scene."""
+        facts = set()
+        for predicate, *arguments in self.goal:
+            facts.add((predicate, *map(self._scene_name, arguments)))
+        return self.scene, frozenset(facts)
+
+    def _scene_name(self, name: str) -> str:
+        """Return the name of a thing or a region, with the owner's name in every task that begins in the scene."""
+        owner = self.owner(name) or ""
+        return self.scene_names.get(owner, owner) + name.removeprefix(owner)
+
     def category(self, name: str) -> str:
         """Return the category of an object or fixture; the name itself if the file declares no such thing."""
         return self.objects.get(name) or self.fixtures.get(name) or name

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.assets import package_folder
+from pipeline.libero.carried import bddl_text
 from pipeline.types import Floats, Task
 
 GET_AGAIN = (
@@ -208,7 +209,7 @@ def proprioception(hands: Floats, joints: Floats) -> dict[str, Floats]:
 
 def task_attributes(task: Task, frame_px: int = FRAME_PX) -> dict[str, str]:
     """Return the attributes of the group ``data`` that depend only on the task and the size of the frames."""
-    bddl = task.bddl_file.read_text()
+    bddl = bddl_text(task)
     (problem,) = re.findall(r"\(problem\s+([^()]+)\)", bddl)
     (language,) = re.findall(r"\(:language\s+([^()]+)\)", bddl)
     bddl_file = f"libero/libero/bddl_files/{task}.bddl"

@@ -9,12 +9,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.libero.bddl import Bddl, Fact, read
+from pipeline.libero.bddl import Bddl, Fact
+from pipeline.libero.carried import definition_of
 from pipeline.types import Floats, Task
 
 PARTS = ("top", "middle", "bottom", "left", "right", "front", "back", "center")
@@ -98,13 +98,13 @@ class TaskGoal:
 
 
 @cache
-def read_goal(bddl_file: Path) -> TaskGoal:
+def read_goal(task: Task) -> TaskGoal:
     """Read the goal of a task.
 
     Raises:
         PipelineError: when the file cannot be read or does not define a task.
     """
-    bddl = read(bddl_file)
+    bddl = definition_of(task)
     scene = _Scene(bddl)
     facts = [fact for fact in bddl.goal if fact not in bddl.start]
     moves = [fact for fact in facts if len(fact) == 3]
@@ -215,7 +215,7 @@ class _Scene:
 @cache
 def _alike(task: Task, thing: str) -> tuple[str, ...]:
     """Return the other objects that have the category of ``thing``."""
-    objects = read(task.bddl_file).objects
+    objects = definition_of(task).objects
     same_category = [name for name, category in objects.items() if category == objects[thing]]
     return tuple(name for name in same_category if name != thing)
 
@@ -226,8 +226,8 @@ def _anchors(task: Task, thing: str) -> tuple[str, ...]:
 
     Return no things if the object starts elsewhere.
     """
-    definition = read(task.bddl_file)
-    beside = definition.beside(definition.places.get(thing, ""))
+    scene = definition_of(task)
+    beside = scene.beside(scene.places.get(thing, ""))
     if beside is None or beside.relation not in ("next to", "between"):
         return ()
     return beside.things

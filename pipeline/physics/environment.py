@@ -16,6 +16,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.arenas import SURFACES
 from pipeline.libero.assets import as_evaluated
+from pipeline.libero.carried import definition_of
 from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import fixed_pose, grip_pose, physics_to_read
@@ -61,6 +62,7 @@ class Environment:
         with seeded(0):
             self._env = until_placed(build, task)
         self._control_step = ControlStep(self._env.env)
+        self._goal = definition_of(task).goal if task.goal_file else ()
         self._openings = len(self._env.env.object_property_initializers)
         self._placed: dict[int, str] = {}
         self._scene: str | None = None
@@ -290,8 +292,8 @@ class Environment:
         return np.array(self._env.sim.model.site_rgba[:, 3], np.float32)
 
     def succeeded(self) -> bool:
-        """Return LIBERO's success check, the conjunction of the BDDL goal's predicates."""
-        return bool(self._env.check_success())
+        """Return LIBERO's success check, the conjunction of the goal's predicates."""
+        return self.satisfies(self._goal) if self._goal else bool(self._env.check_success())
 
     def satisfies(self, goal: Iterable[Sequence[str]]) -> bool:
         """Return whether all facts of a goal hold, such as the goal of another task in the same scene."""

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
+from pipeline.libero.carried import definition_of
 from pipeline.scenes.compiled import ARM, FINGERS, CompiledScene, contacts, grip_pose
 from pipeline.types import Floats, Quality, State, Task, Trajectory
 
@@ -27,7 +27,7 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
     """
     scene = CompiledScene(trajectory.scene)
     model = scene.model
-    target_names = of_goal(bddl.read(task.bddl_file))
+    target_names = of_goal(definition_of(task))
     allowed_roots = {int(model.body(f"{name}_main").rootid[0]) for name in target_names}
     robot = int(model.body("robot0_base").rootid[0])
     positions, rotations, touched_steps = [], [], 0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ from pipeline.scenes.compiled import CompiledScene, fixed_pose, grip_pose
 from pipeline.types import Floats, Scene
 
 Mask = NDArray[np.bool_]
+T = TypeVar("T")
 
 FALL = 10
 """Control steps (0.5 s) within which a released object comes down on its target."""
@@ -82,6 +84,26 @@ class Reference:
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    def in_scene(self, names: Mapping[str, str]) -> Reference:
+        """Return the rollout for another scene, without the things that this scene lacks.
+
+        Args:
+            names: object, fixture or region to its name in the other scene.
+        """
+        return replace(
+            self,
+            held=_renamed(self.held, names),
+            carried=_renamed(self.carried, names),
+            met=_renamed(self.met, names),
+            poses=_renamed(self.poses, names),
+            places=_renamed(self.places, names),
+        )
+
+
+def _renamed(by_name: Mapping[str, T], names: Mapping[str, str]) -> dict[str, T]:
+    """Return the entries that have a new name, under this name."""
+    return {names[name]: value for name, value in by_name.items() if name in names}
 
 
 def _contacts(

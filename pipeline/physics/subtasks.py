@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl, Fact
+from pipeline.libero.carried import definition_of
 from pipeline.libero.task_goal import called, where
 from pipeline.physics.reference import Mask, runs
 from pipeline.scenes.compiled import CompiledScene, contacts
@@ -87,7 +87,7 @@ def subtasks_by_contacts(
         model: a compiled model of its scene.
         pairs: pairs (C, 2) of bodies in contact in each of its K+1 states.
     """
-    problem, seen = bddl.read(task.bddl_file), _Seen(trajectory, model, pairs)
+    problem, seen = definition_of(task), _Seen(trajectory, model, pairs)
     deeds: set[_Deed] = set()
     for fact in problem.goal:
         deeds.update(seen.deeds(problem, fact))

@@ -22,11 +22,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.axes import Perturbation, from_json
+from pipeline.axes import Perturbation, from_json, task_of
 from pipeline.axes.base import Nearest
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
-from pipeline.libero.tasks import find_task
 from pipeline.planning.plan import Row
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
@@ -104,10 +103,8 @@ def check(rows: Sequence[Row | Compared], test: TestSet) -> dict[str, AxisDistan
     """
     compared: dict[str, list[tuple[Nearest, str, Perturbation]]] = defaultdict(list)
     wanted: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
-    names = {(row.suite, row.task) for row in rows}
-    tasks = {(suite, name): find_task(suite, name) for suite, name in names}
     for row in rows:
-        task = tasks[row.suite, row.task]
+        task = task_of(row.suite, row.task, row.perturbations)
         for perturbation in from_json(row.perturbations):
             compared[perturbation.axis].append((perturbation.nearest(test, task), row.episode_id, perturbation))
             if row.wanted:
@@ -154,7 +151,7 @@ def covered_by(
     """
     draws: dict[str, list[tuple[Perturbation, Task]]] = {axis: [] for axis in findings}
     for row in kept:
-        task = find_task(row["suite"], row["task"])
+        task = task_of(row["suite"], row["task"], row["perturbations"])
         for perturbation in from_json(row["perturbations"]):
             draws[perturbation.axis].append((perturbation, task))
     covered = {}

@@ -7,7 +7,7 @@ from functools import lru_cache
 from itertools import count, islice
 from math import ceil
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import pyarrow as pa
 
@@ -71,7 +71,8 @@ class Row:
     def reset_seed(self) -> int | None:
         """Seed of the reset of LIBERO's environment that starts the replay; ``None`` if it starts as recorded."""
         if self.axis != RESET:
-            return None
+            seeds = (perturbation.reset_seed for perturbation in from_json(self.perturbations))
+            return next((seed for seed in seeds if seed is not None), None)
         return int(rng(self.seed, self.axis, self.demo_id, self.variant).integers(2**32))
 
 
@@ -113,8 +114,8 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
             dealt = sorted(group, key=lambda demo: digest(plan.seed, name, demo.demo_id))
             candidates = islice(_candidates(draws, dealt), wanted + ceil(wanted * plan.reserve))
             for rank, (demo, perturbations, variant) in enumerate(candidates):
-                row = _row(demo, perturbations, plan.seed, replay)
-                rows.append(replace(row, rank=rank, variant=variant, wanted=rank < wanted))
+                candidate = row(demo, perturbations, plan.seed, replay)
+                rows.append(replace(candidate, rank=rank, variant=variant, wanted=rank < wanted))
     return rows
 
 
@@ -125,7 +126,7 @@ def _all_apply(axes: Sequence[Axis], task: Task) -> bool:
 
 def twins(demos: Sequence[DemoEntry], seed: int, replay: ReplayConfig) -> list[Row]:
     """Return the clean twin of each demonstration of a task."""
-    return [replace(_row(demo, (), seed, replay), rank=rank) for rank, demo in enumerate(demos)]
+    return [replace(row(demo, (), seed, replay), rank=rank) for rank, demo in enumerate(demos)]
 
 
 def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, replay: ReplayConfig) -> list[Row]:
@@ -214,6 +215,20 @@ class Dealt:
             self._times[entries[place]] += 1
 
 
+class _Choice(NamedTuple):
+    """First sample of an axis.
+
+    Attributes:
+        task: the task that the axis perturbs, which an earlier axis may have carried to another scene.
+        place: index into the axis's ``entries``.
+    """
+
+    axis: Axis
+    task: Task
+    place: int
+    perturbation: Perturbation
+
+
 @dataclass(frozen=True)
 class Draws:
     """Source of perturbations for a plan's episodes of one axis or combination.
@@ -250,32 +265,42 @@ class Draws:
         sampled: set[tuple[str, ...]] = set()
         for variant in count():
             key = (demo_id, variant)
-            turns = [dealt.in_turn(axis.entries(task), digest(self.seed, self.name, *key)) for axis in self.axes]
             for attempt in range(_ATTEMPTS):
-                places = [places_of_axis[attempt % len(places_of_axis)] for places_of_axis in turns]
-                perturbations = self._sampled(task, places, earlier, (*key, attempt))
+                choices = self._choices(task, attempt, dealt, earlier, key)
+                perturbations = self._cleared(choices, earlier, (*key, attempt))
                 content = tuple(perturbation.model_dump_json() for perturbation in perturbations or ())
                 if perturbations and content not in sampled:
                     break
             else:
                 return
             sampled.add(content)
-            for axis, place in zip(self.axes, places, strict=True):
-                dealt.give(axis.entries(task), place)
+            for choice in choices:
+                dealt.give(choice.axis.entries(choice.task), choice.place)
             yield perturbations
 
-    def _sampled(
-        self, task: Task, places: Sequence[int], earlier: Sequence[Perturbation], key: tuple[str | int, ...]
-    ) -> tuple[Perturbation, ...] | None:
-        """Sample one perturbation of each axis, or return ``None`` if an axis has none that passes ``_clear``."""
-        random = rng(self.seed, self.name, *key)
+    def _choices(
+        self, task: Task, attempt: int, dealt: Dealt, earlier: Sequence[Perturbation], key: tuple[str | int, ...]
+    ) -> list[_Choice]:
+        """Sample one perturbation of each axis, in the order in which they apply."""
         # One generator samples all first perturbations. Each axis that samples again uses a generator of its own.
-        sampled = []
-        for axis, place in zip(self.axes, places, strict=True):
-            sampled.append(axis.sample(random, task, place).after(earlier))
-        instruction = " ".join(change.apply("") for change in sampled if isinstance(change, TextPerturbation))
+        random = rng(self.seed, self.name, *key, attempt)
+        choices: list[_Choice] = []
+        for axis in self.axes:
+            turn = dealt.in_turn(axis.entries(task), digest(self.seed, self.name, *key))
+            place = turn[attempt % len(turn)]
+            perturbation = axis.sample(random, task, place).after(earlier)
+            choices.append(_Choice(axis, task, place, perturbation))
+            task = perturbation.played(task)
+        return choices
+
+    def _cleared(
+        self, choices: Sequence[_Choice], earlier: Sequence[Perturbation], key: tuple[str | int, ...]
+    ) -> tuple[Perturbation, ...] | None:
+        """Return one perturbation of each choice, or ``None`` if an axis has none that passes ``_clear``."""
+        texts = [choice.perturbation for choice in choices]
+        instruction = " ".join(change.apply("") for change in texts if isinstance(change, TextPerturbation))
         perturbations = []
-        for number, (first, axis) in enumerate(zip(sampled, self.axes, strict=True)):
+        for number, (axis, task, _, first) in enumerate(choices):
             clear = self._clear(first, axis, task, instruction, earlier, (*key, number))
             if clear is None:
                 return None
@@ -361,7 +386,7 @@ def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[Demo
             return
 
 
-def _row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, replay: ReplayConfig) -> Row:
+def row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, replay: ReplayConfig) -> Row:
     """Build the row of a wanted episode, with rank and variant 0."""
     perturbations = in_order(perturbations)
     physics = to_json(of_layer(perturbations, PhysicsPerturbation))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import ALL_VIEWS, MAPS, SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode_exactly, to_policy
-from pipeline.libero import bddl
+from pipeline.libero.carried import definition_of
 from pipeline.planning.streams import Stream
 from pipeline.rendering.drawing import Surfaces
 from pipeline.rendering.renderer import Renderer
@@ -45,7 +45,7 @@ class Instances:
     """
 
     def __init__(self, model: mujoco.MjModel, task: Task, resolved: Mapping[str, Any] = MappingProxyType({})):
-        problem = bddl.read(task.bddl_file)
+        problem = definition_of(task)
         things = problem.things
         self.names: tuple[str, ...] = (*COMMON, *things, *added_names(resolved))
         rows = SCHEMA.object_poses.shape[0]

@@ -11,7 +11,7 @@ from pipeline.axes import RenderPerturbation
 from pipeline.axes.camera import CameraPerturbation, Component
 from pipeline.axes.light import exposure
 from pipeline.episode_schema import SCHEMA, SIZE_PX
-from pipeline.libero import bddl
+from pipeline.libero.carried import definition_of
 from pipeline.planning.streams import Stream
 from pipeline.rendering.renderer import Renderer
 from pipeline.scenes.placement import added_objects, enough_seen
@@ -64,7 +64,7 @@ class Sight:
         pixels = np.bincount(model.body_rootid[bodies], minlength=model.nbody)
         trees = np.rint(pixels * (SIZE_PX / renderer.drawing.size_px) ** 2).astype(int)
         camera = model.camera(CAMERA).id
-        things = bddl.read(task.bddl_file).things_of_interest
+        things = definition_of(task).things_of_interest
         # A camera looks along its -z axis.
         x, y, z = ((hand_m - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)).T
         half_width = -z * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)

@@ -12,12 +12,11 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from pipeline.axes import Perturbation, TextPerturbation, from_json
+from pipeline.axes import Perturbation, TextPerturbation, from_json, task_of
 from pipeline.axes.report_data import KeptPerturbation
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import read_json
-from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
 from pipeline.planning.streams import streams_of
 from pipeline.report import coverage, figures, pages, seen, yields
@@ -33,7 +32,7 @@ from pipeline.run.layout import LEAKAGE, PREVIEWS, SHEETS
 from pipeline.run.run import Run
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Floats, Quality
+from pipeline.types import Floats, Quality, Task
 
 ById = Mapping[str, Mapping[str, Any]]
 """Episode id to its row of the manifest."""
@@ -194,9 +193,13 @@ def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
         for row, made in of_axis:
             if row["kept"]:
                 resolved = json.loads(row["resolved"]).get(axis)
-                kept.append(KeptPerturbation(find_task(row["suite"], row["task"]), made, resolved))
+                kept.append(KeptPerturbation(_task(row), made, resolved))
         plots_and_tables[axis] = coverage.plot_axis(axis, kept, test), table
     return plots_and_tables
+
+
+def _task(row: Mapping[str, Any]) -> Task:
+    return task_of(row["suite"], row["task"], row["perturbations"])
 
 
 def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
@@ -205,7 +208,7 @@ def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
     for row in kept:
         for made in from_json(row["perturbations"]):
             if isinstance(made, TextPerturbation):
-                original = find_task(row["suite"], row["task"]).instruction
+                original = _task(row).instruction
                 label = f"{made.component.replace('_', ' ')}, level {made.level}"
                 quoted.setdefault(made.component, []).append((label, original, row["instruction"]))
     dealt = chain.from_iterable(zip_longest(*quoted.values()))

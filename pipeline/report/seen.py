@@ -17,11 +17,10 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.axes import AXES, from_json
+from pipeline.axes import AXES, from_json, task_of
 from pipeline.axes.report_data import CLEAN, KeptPerturbation
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import decode
-from pipeline.libero.tasks import find_task
 from pipeline.planning.plan import Row
 from pipeline.run import outcome
 from pipeline.run.finished import SEEN
@@ -129,7 +128,7 @@ def _together(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, float]]
     """Yield the measures of all kept episodes together."""
     changes: list[tuple[str, KeptPerturbation[Any]]] = []
     for row in rows:
-        task = find_task(row.suite, row.task)
+        task = task_of(row.suite, row.task, row.perturbations)
         changes += [(change.axis, KeptPerturbation(task, change, None)) for change in from_json(row.perturbations)]
     for name, kept in grouped(changes).items():
         for what, value in AXES[name].observe_together(kept, test):
@@ -171,7 +170,7 @@ class _Observed:
 
     @property
     def task(self) -> Task:
-        return find_task(self._row.suite, self._row.task)
+        return task_of(self._row.suite, self._row.task, self._row.perturbations)
 
     @property
     def instruction(self) -> str:

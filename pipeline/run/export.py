@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pipeline.axes import from_json, task_of
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.episode_schema import SCHEMA
@@ -34,13 +35,13 @@ from pipeline.files import (
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.identity import refuse_unasked
-from pipeline.libero.tasks import find_task
 from pipeline.record import Basis
 from pipeline.run.layout import DATASETS
 from pipeline.run.outcome import shuffled
 from pipeline.run.run import Run
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
+from pipeline.types import Task
 
 AnyFormat = Format[Any]
 
@@ -131,7 +132,7 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     episodes: dict[str, Known] = {}
     for episode_id in shuffled(outcome.missed) if failures else outcome.kept:
         row, content = outcome.row_of[episode_id], outcome.content(episode_id)
-        rewrites[episode_id] = wordings(language, row.suite, row.task, row.axis)
+        rewrites[episode_id] = wordings(language, row.suite, row.task, row.perturbations)
         content = digest(content, rewrites[episode_id])[:16]
         steps = outcome.trajectories[row.trajectory_id]["steps"]
         episodes[episode_id] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
@@ -139,14 +140,20 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     return Episodes(episodes, load)
 
 
-@cache
-def wordings(axis: LanguageAxis | None, suite: str, task: str, axes: str) -> tuple[str, ...]:
-    """List the rewrites that a language axis may sample for an episode of these axes.
+def wordings(axis: LanguageAxis | None, suite: str, task: str, perturbations: str) -> tuple[str, ...]:
+    """List the rewrites that a language axis may sample for an episode with these perturbations.
 
     Args:
         axis: `None` for the axis with default ranges.
+        perturbations: JSON list, as in the columns of the plan and the manifest.
     """
-    return (axis or LanguageAxis()).wordings(find_task(suite, task), axes.split("+"), benchmark.load())
+    axes = tuple(perturbation.axis for perturbation in from_json(perturbations))
+    return _wordings(axis or LanguageAxis(), task_of(suite, task, perturbations), axes)
+
+
+@cache
+def _wordings(axis: LanguageAxis, task: Task, axes: tuple[str, ...]) -> tuple[str, ...]:
+    return axis.wordings(task, axes, benchmark.load())
 
 
 def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline import gl
+from pipeline.axes import task_of
 from pipeline.compute.pool import LOST
 from pipeline.config import RenderConfig
 from pipeline.errors import PipelineError
-from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
 from pipeline.planning.plan import Row
 from pipeline.planning.streams import Stream
@@ -55,7 +55,7 @@ class RenderJob:
         trajectory = self._trajectory()
         parts, missing = self._stored()
         if missing:
-            task = find_task(self.row.suite, self.row.task)
+            task = task_of(self.row.suite, self.row.task, self.row.perturbations)
             if trajectory.quality is None:  # The replay of a failure stores no quality.
                 trajectory = replace(trajectory, quality=measure(trajectory, task))
             parts = [*parts, render(trajectory, task, missing, self.render_config, scene_of_process())]

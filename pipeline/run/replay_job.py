@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.axes import PhysicsPerturbation, from_json, of_layer
+from pipeline.axes import PhysicsPerturbation, from_json, of_layer, task_of
 from pipeline.compute.pool import LOST
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
+from pipeline.libero.carried import all_counterparts
 from pipeline.libero.starts import LEFT_OUT_STEPS, kept_actions
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.quality import measure
@@ -18,7 +19,7 @@ from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
 from pipeline.planning.plan import Row
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Demo, Scene, Trajectory, Verdict
+from pipeline.types import Demo, Scene, Task, Trajectory, Verdict
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,14 @@ class ReplayJob:
                 remedy="restore the file, or run the plan stage again, which samples for the present content",
             )
         physics = of_layer(from_json(self.row.perturbations), PhysicsPerturbation)
-        environment = shared(demo.task)
-        reference = partial(self._reference, environment, demo)
-        start, replay_config = demo, self.replay_config
+        task = task_of(self.row.suite, self.row.task, self.row.perturbations)
+        environment = shared(task)
+        reference = partial(self._reference, demo, task)
+        start, replay_config = replace(demo, task=task), self.replay_config
         seed = self.row.reset_seed
         if seed is not None:
             # Open-loop actions would succeed by luck, and teach that object positions do not matter.
-            start = _at_reset(environment, demo, seed)
+            start = _at_reset(environment, start, seed)
             replay_config = replay_config.model_copy(update={"mode": "tracked"})
         trajectory = replay(environment, start, self.row.trajectory_id, replay_config, physics, reference)
         # Open-loop actions do not work against a push either.
@@ -65,12 +67,19 @@ class ReplayJob:
         if tracks and trajectory.verdict.kept and trajectory.mode != "tracked":
             trajectory = replace(trajectory, verdict=Verdict(False, "no_reference"))
         if trajectory.verdict.kept:
-            trajectory = replace(trajectory, quality=measure(trajectory, demo.task))
+            trajectory = replace(trajectory, quality=measure(trajectory, task))
         TrajectoryStore(self.folder).save(trajectory)
         return trajectory.verdict
 
-    def _reference(self, environment: Environment, demo: Demo) -> Reference | None:
-        """Return the reference that tracking follows: the clean twin if it reached its goal, else the recording."""
+    def _reference(self, demo: Demo, task: Task) -> Reference | None:
+        """Return the reference that tracking follows in the scene of ``task``."""
+        reference = self._motion(demo)
+        if reference is None or task.goal_file is None:
+            return reference
+        return reference.in_scene(all_counterparts(task))
+
+    def _motion(self, demo: Demo) -> Reference | None:
+        """Return the motion of the clean twin if it reached its goal, else of the recording."""
         if self.twin != self.row.trajectory_id:
             twin = TrajectoryStore(self.folder).path(self.twin)
             reference = _twin(edition(twin))
@@ -79,11 +88,11 @@ class ReplayJob:
         if demo.states is None:
             # Replay the recorded hand motion, which began before anything settled.
             unsettled = self.replay_config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
-            return _followed(replay(environment, demo, self.row.trajectory_id, unsettled))
+            return _followed(replay(shared(demo.task), demo, self.row.trajectory_id, unsettled))
         mask = kept_actions(demo.actions, self.replay_config.noops)
         # The state after the last action is not recorded: assume that the hand rests.
         states = np.vstack([demo.states[mask], demo.states[-1:]])
-        model_xml = demo.model_xml or environment.place_fixtures(self.replay_config.fixture_seed)
+        model_xml = demo.model_xml or shared(demo.task).place_fixtures(self.replay_config.fixture_seed)
         return Reference.of(model_xml, states, demo.actions[mask])
 
     def limit_s(self) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline import rotations
 from pipeline.errors import RefusedError
-from pipeline.libero import bddl
+from pipeline.libero.carried import definition_of
 from pipeline.libero.task_goal import relation_holds
 from pipeline.scenes.compiled import CompiledScene, simulate_held
 from pipeline.types import Floats, Scene, Task
@@ -64,7 +64,7 @@ def move(scene: Scene, task: Task, moves: Moves) -> Scene:
             leaves the place that the instruction names; ``object_in_collision`` when things touch that did not touch
             before; ``object_unstable`` when an object slides or tilts more than the recorded object.
     """
-    definition = bddl.read(task.bddl_file)
+    definition = definition_of(task)
     before = CompiledScene(scene)
     regions = {region: moves[thing] for region, thing in definition.goal_regions.items() if thing in moves}
     fixtures = {name: shift for name, shift in moves.items() if name in definition.fixtures}
@@ -98,7 +98,7 @@ def _shifted(model_xml: str, fixtures: Moves, regions: Moves) -> str:
 
 def _refuse_relations(task: Task, scene: CompiledScene) -> None:
     """Reject a scene with a target outside of the place that the instruction names."""
-    if not all(relation_holds(task, target, scene.xy_m) for target in bddl.read(task.bddl_file).targets):
+    if not all(relation_holds(task, target, scene.xy_m) for target in definition_of(task).targets):
         raise RefusedError("relation_broken")
 
 

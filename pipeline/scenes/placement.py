@@ -13,9 +13,9 @@ import numpy as np
 from pipeline import seeding
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.errors import RefusedError
-from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
 from pipeline.libero.bddl import Bddl
+from pipeline.libero.carried import definition_of
 from pipeline.scenes.agent_view import AgentView
 from pipeline.scenes.compiled import CompiledScene, physics_to_read, simulate_held
 from pipeline.scenes.swept_path import SweptPath
@@ -59,7 +59,7 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
     Raises:
         RefusedError: when no place was found; its reason is the most frequent reason for the rejection of places.
     """
-    placement = _Placement(scene, roll_out(scene, demo), objects, bddl.read(demo.task.bddl_file))
+    placement = _Placement(scene, roll_out(scene, demo), objects, definition_of(demo.task))
     rejected: Counter[str] = Counter()
     for attempt in range(SCENES):
         poses = placement.draw(seeding.rng(seed, "layout", attempt), rejected)

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.axes import task_of
 from pipeline.episode_schema import MOTION, SCHEMA
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.images.jpeg import decode, decode_exactly
-from pipeline.types import Episode, Frame, Trajectory
+from pipeline.types import Episode, Frame, Task, Trajectory
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,11 @@ class Case:
     copies: Sequence[Copy]
     bank: Path | None
     witness: bool = False
+
+    @cached_property
+    def task(self) -> Task:
+        """Task that the episode carries out."""
+        return task_of(self.row["suite"], self.row["task"], self.row["perturbations"])
 
     @cached_property
     def levels(self) -> dict[str, NDArray[np.int64]]:

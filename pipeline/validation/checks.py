@@ -16,8 +16,8 @@ from pipeline.formats.annotations import event_annotations, persistent_annotatio
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_depth, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.images.jpeg import decode_exactly
-from pipeline.libero import bddl
-from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
+from pipeline.libero.carried import definition_of
+from pipeline.libero.tasks import WITHOUT_DEBRIS, debris
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.run.manifest import labels_of as labels_of_row
 from pipeline.types import Frame
@@ -202,7 +202,7 @@ def labels(case: Case) -> Iterator[Fault]:
 
 def wording(case: Case) -> Iterator[Fault]:
     """Check that the instruction is the task's or the sampled rewrite of the bank, without parts of a file's name."""
-    task, text = find_task(case.row["suite"], case.row["task"]), case.row["instruction"]
+    task, text = case.task, case.row["instruction"]
     expected = task.instruction
     for change in of_layer(from_json(case.row["perturbations"]), TextPerturbation):
         expected = change.apply(expected)
@@ -322,7 +322,7 @@ def boxes(case: Case) -> Iterator[Fault]:
 
 def _goal_places(case: Case) -> list[int]:
     """List the places in ``instances`` of the things that the task's goal names."""
-    problem = bddl.read(find_task(case.row["suite"], case.row["task"]).bddl_file)
+    problem = definition_of(case.task)
     named_things: set[str] = set()
     for fact in problem.goal:
         named_things.update(problem.things_named(fact[1:]))

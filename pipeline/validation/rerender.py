@@ -16,7 +16,6 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import encode
-from pipeline.libero.tasks import find_task
 from pipeline.physics.subtasks import subtasks as find_subtasks
 from pipeline.rendering.renderer import LastScene
 from pipeline.types import Frame
@@ -70,7 +69,7 @@ def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iter
 
 def subtasks(case: Case) -> Iterator[Fault]:
     """Compute the subtasks again from the states of the replay alone, and compare them with the stored ones."""
-    expected = find_subtasks(case.trajectory, find_task(case.row["suite"], case.row["task"]))
+    expected = find_subtasks(case.trajectory, case.task)
     if tuple(case.made.subtasks) != expected:
         yield case.finding("frames", f"subtasks {list(case.made.subtasks)}", list(expected))
 

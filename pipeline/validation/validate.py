@@ -14,6 +14,7 @@ from operator import call
 from pathlib import Path
 from typing import Any
 
+from pipeline.axes import task_of
 from pipeline.clients import oft
 from pipeline.compute.pool import Workers
 from pipeline.errors import PipelineError
@@ -24,7 +25,6 @@ from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.rlds_layout import datasets
 from pipeline.grouping import grouped
-from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
 from pipeline.planning import selection
 from pipeline.rendering.renderer import scene_of_process
@@ -225,7 +225,9 @@ class EpisodesJob:
 
     def __call__(self, rows: Sequence[Row]) -> Results:
         results, language = Results(), self.run.config.plan.axes.language
-        rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
+        rewrites = {}
+        for row in rows:
+            rewrites[row["episode_id"]] = wordings(language, row["suite"], row["task"], row["perturbations"])
         load = self.run.episodes(failures=self.of_failures, rewrites=rewrites)
         for row in rows:
             self._check(row, load, results)
@@ -255,7 +257,7 @@ class EpisodesJob:
             return
         results.note("stored", [])
         if self.of_failures:  # The manifest has figures of kept episodes only.
-            quality = measure(trajectory, find_task(row["suite"], row["task"]))
+            quality = measure(trajectory, task_of(row["suite"], row["task"], row["perturbations"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
         language = self.run.config.plan.axes.language
         witness = episode_id in sorted(self.witnesses)[:WHOLE]

@@ -42,22 +42,22 @@ CADDY = find_task("libero_10", "STUDY_SCENE1_pick_up_the_book_and_place_it_in_th
 
 
 def test_the_goal_is_read_in_kinds_and_parts() -> None:
-    assert read_goal(MUGS.bddl_file).aims == (
+    assert read_goal(MUGS).aims == (
         Aim("on", "porcelain_mug", "plate", "left"),
         Aim("on", "white_yellow_mug", "plate", "right"),
     )
-    assert read_goal(PUDDING.bddl_file).aims[1] == Aim("right", "chocolate_pudding", "plate")
-    shut = read_goal(SHUT.bddl_file)
+    assert read_goal(PUDDING).aims[1] == Aim("right", "chocolate_pudding", "plate")
+    shut = read_goal(SHUT)
     assert shut.aims == (Aim("in", "akita_black_bowl", "white_cabinet", "bottom"),)
     assert shut.changes == (StateChange("close", "white_cabinet", "bottom"),)
-    between = read_goal(BETWEEN.bddl_file)
+    between = read_goal(BETWEEN)
     assert between.aims == (Aim("on", "akita_black_bowl", "plate"),)
     assert {aim.place for aim in between.starts if aim.relation == "between"} == {
         "plate",
         "glazed_rim_porcelain_ramekin",
     }
     # The stove is on at the start, so only the two pots are wanted.
-    pots = read_goal(POTS.bddl_file)
+    pots = read_goal(POTS)
     assert (pots.changes, pots.pairs) == ((), ("moka_pot",))
 
 

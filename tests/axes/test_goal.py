@@ -1,0 +1,217 @@
+"""Tasks in the scenes of other tasks: which scenes, what LIBERO's own files and environment say of them, and plans."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import starter_demo
+
+from pipeline.axes import from_json, task_of
+from pipeline.axes.goal import GoalAxis, GoalPerturbation, Pair, held_out, level, pairs
+from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.libero import bddl
+from pipeline.libero.carried import CannotCarryError, bddl_text, carried, definition_of
+from pipeline.libero.tasks import SUITES, find_task, tasks
+from pipeline.planning import plan
+from pipeline.run.replay_job import ReplayJob
+from pipeline.seeding import rng
+from pipeline.stores.trajectory_store import TrajectoryStore
+
+PICK, PLATE = "pick_up_the_", "_and_place_it_on_the_plate"
+BASKET = "_and_place_it_in_the_basket"
+
+SPATIAL = {
+    "next_to_the_plate": "next_to_the_ramekin",
+    "between_the_plate_and_the_ramekin": "next_to_the_ramekin",
+    "on_the_ramekin": "on_the_cookie_box",
+    "next_to_the_ramekin": "next_to_the_cookie_box",
+    "next_to_the_cookie_box": "on_the_stove",
+    "from_table_center": "next_to_the_plate",
+    "on_the_cookie_box": "on_the_wooden_cabinet",
+    "in_the_top_drawer_of_the_wooden_cabinet": "on_the_wooden_cabinet",
+}
+"""Place of the bowl in a scene's own task to the place of its other bowl, by the scene's BDDL file.
+
+The scene with bowls on the stove and on the cabinet has two tasks of LIBERO, and none of other scenes."""
+
+ALSO = {
+    ("libero_10", "LIVING_ROOM_SCENE1_put_both_the_alphabet_soup_and_the_cream_cheese_box_in_the_basket"): {
+        "LIVING_ROOM_SCENE2_put_both_the_alphabet_soup_and_the_tomato_sauce_in_the_basket"
+    },
+    ("libero_10", "LIVING_ROOM_SCENE2_put_both_the_alphabet_soup_and_the_tomato_sauce_in_the_basket"): {
+        "LIVING_ROOM_SCENE1_put_both_the_alphabet_soup_and_the_cream_cheese_box_in_the_basket"
+    },
+    ("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove"): set(),
+    ("libero_90", "KITCHEN_SCENE2_open_the_top_drawer_of_the_cabinet"): {
+        "KITCHEN_SCENE1_open_the_bottom_drawer_of_the_cabinet"
+    },
+    ("libero_90", "STUDY_SCENE1_pick_up_the_book_and_place_it_in_the_front_compartment_of_the_caddy"): {
+        "STUDY_SCENE2_pick_up_the_book_and_place_it_in_the_back_compartment_of_the_caddy"
+    },
+}
+"""Task of a scene to the tasks of other scenes that it allows, read in LIBERO's files by hand."""
+
+
+def usable(suite: str) -> list[Pair]:
+    return [pair for pair in pairs(suite) if not pair.left_out]
+
+
+def test_the_other_bowl_of_a_spatial_scene_is_the_bowl_of_one_task() -> None:
+    found = {(pair.scene.name, pair.task.name) for pair in usable("libero_spatial")}
+    bowl = f"{PICK}black_bowl_"
+    assert found == {(f"{bowl}{own}{PLATE}", f"{bowl}{other}{PLATE}") for own, other in SPATIAL.items()}
+
+
+def test_the_targets_of_an_object_scene_are_the_groceries_in_its_file() -> None:
+    """The declared objects are read by a pattern, without the parser."""
+    expected, names = set(), {task.name for task in tasks("libero_object")}
+    for scene in tasks("libero_object"):
+        (declared,) = re.findall(r"\(:objects([^)]*)\)", scene.bddl_file.read_text())
+        for grocery in re.findall(r"- (\w+)", declared):
+            name = f"{PICK}{grocery}{BASKET}"
+            if name in names - {scene.name}:
+                expected.add((scene.name, name))
+    assert {(pair.scene.name, pair.task.name) for pair in usable("libero_object")} == expected
+    assert len(expected) == 50
+
+
+@pytest.mark.parametrize("scene", ALSO, ids=[name for _, name in ALSO])
+def test_scenes_of_the_other_suites(scene: tuple[str, str]) -> None:
+    suite, name = scene
+    assert {pair.task.name for pair in usable(suite) if pair.scene.name == name} == ALSO[scene]
+
+
+def test_every_pair_of_the_130_tasks_is_used_or_left_out_with_a_reason() -> None:
+    counts = {suite: (len(pairs(suite)), len(usable(suite)), len(held_out(suite))) for suite in SUITES}
+    assert counts == {
+        "libero_spatial": (80, 8, 2),
+        "libero_object": (90, 50, 10),
+        "libero_goal": (0, 0, 0),
+        "libero_10": (80, 2, 0),
+        "libero_90": (1710, 6, 1),
+    }
+    reasons = {(pair.task.name, pair.scene.name): pair.left_out for pair in pairs("libero_90")}
+    close = "KITCHEN_SCENE4_close_the_bottom_drawer_of_the_cabinet"
+    assert reasons[close, "KITCHEN_SCENE7_open_the_microwave"] == "the scene has no white cabinet"
+    # The plate, the bowl and the cabinet are there, and LIBERO asks for this itself.
+    on_plate = "KITCHEN_SCENE1_put_the_black_bowl_on_the_plate"
+    closed = "KITCHEN_SCENE5_close_the_top_drawer_of_the_cabinet"
+    assert reasons[on_plate, closed] == "LIBERO has this instruction in the scene"
+    lit = "KITCHEN_SCENE8_turn_off_the_stove"
+    assert reasons[lit, "KITCHEN_SCENE3_put_the_frying_pan_on_the_stove"] == (
+        "the flat stove is open, closed or lit where it is not in the demonstration"
+    )
+
+
+def test_a_carried_task_has_the_scene_of_one_file_and_the_goal_of_the_other() -> None:
+    for suite in SUITES:
+        for pair in usable(suite):
+            made, scene, task = map(definition_of, (pair.played, pair.scene, pair.task))
+            assert replace(made, language=scene.language, goal=scene.goal, of_interest=scene.of_interest) == scene
+            assert (made.language, pair.played.instruction) == (task.language, pair.task.instruction)
+            kinds = [[made.category(made.owner(name) or name) for name in fact[1:]] for fact in made.goal]
+            assert kinds == [[task.category(task.owner(name) or name) for name in fact[1:]] for fact in task.goal]
+            assert bddl.parse(bddl_text(pair.played), "") == made
+
+
+def test_the_bowl_is_the_one_that_the_instruction_means() -> None:
+    scene = find_task("libero_spatial", f"{PICK}black_bowl_on_the_ramekin{PLATE}")
+    task = find_task("libero_spatial", f"{PICK}black_bowl_on_the_cookie_box{PLATE}")
+    assert definition_of(task).goal == (("on", "akita_black_bowl_1", "plate_1"),)
+    assert definition_of(carried(task, scene)).goal == (("on", "akita_black_bowl_2", "plate_1"),)
+    assert ("on", "akita_black_bowl_2", "cookies_1") in definition_of(scene).start
+    with pytest.raises(CannotCarryError, match="no akita black bowl stands at its place"):
+        definition_of(carried(scene, task))
+
+
+def test_levels_are_distances_between_what_both_tasks_take() -> None:
+    """The regions of the object suite are squares of 5 cm, whose middles are read by hand."""
+    soup, milk, butter = (
+        find_task("libero_object", f"{PICK}{name}{BASKET}") for name in ("alphabet_soup", "milk", "butter")
+    )
+    # Soup at (-0.12, -0.24), milk at (0.10, -0.20), butter at (-0.20, -0.08).
+    assert np.hypot(0.22, 0.04) == pytest.approx(0.224, abs=1e-3)
+    assert level(milk, soup) == 3
+    assert np.hypot(0.08, 0.16) == pytest.approx(0.179, abs=1e-3)
+    assert level(butter, soup) == 2
+
+
+def test_held_out_pairs_are_never_planned() -> None:
+    axis = GoalAxis()
+    for suite in SUITES:
+        planned = set()
+        for task in tasks(suite):
+            planned |= {(task.name, scene) for scene in axis.entries(task)}
+        held = {(task.name, scene.name) for task, scene in held_out(suite)}
+        assert not planned & held
+        assert planned | held == {(pair.task.name, pair.scene.name) for pair in usable(suite)}
+
+
+def test_starts_are_shared_by_all_tasks_of_a_scene() -> None:
+    one, other = (GoalPerturbation(scene="a", start=3, level=each) for each in (1, 5))
+    assert one.reset_seed == other.reset_seed
+    seeds = {GoalPerturbation(scene=scene, start=start, level=1).reset_seed for scene in "ab" for start in range(50)}
+    assert len(seeds) == 100
+
+
+def test_draws_are_keyed_and_within_the_configured_levels() -> None:
+    milk = find_task("libero_object", f"{PICK}milk{BASKET}")
+    axis = GoalAxis(levels=(2, 3), starts=4)
+    drawn = [axis.sample(rng(0, "goal", number), milk, number % len(axis.entries(milk))) for number in range(100)]
+    assert drawn == [
+        axis.sample(rng(0, "goal", number), milk, number % len(axis.entries(milk))) for number in range(100)
+    ]
+    assert {one.level for one in drawn} <= {2, 3}
+    assert {one.start for one in drawn} == {0, 1, 2, 3}
+    assert {one.scene for one in drawn} == set(axis.entries(milk))
+    assert not GoalAxis().applies(tasks("libero_goal")[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("suite", "task", "scene", "goal"),
+    [
+        ("libero_object", f"{PICK}milk{BASKET}", f"{PICK}alphabet_soup{BASKET}", "(In milk_1 basket_1_contain_region)"),
+        (
+            "libero_spatial",
+            f"{PICK}black_bowl_on_the_cookie_box{PLATE}",
+            f"{PICK}black_bowl_on_the_ramekin{PLATE}",
+            "(On akita_black_bowl_2 plate_1)",
+        ),
+    ],
+)
+def test_a_kept_replay_repeats_in_liberos_own_environment_of_the_scene(
+    suite: str, task: str, scene: str, goal: str, tmp_path: Path
+) -> None:
+    """Its BDDL file is the scene's, with the goal written here."""
+    from libero.libero.envs.env_wrapper import ControlEnv
+    from repeat_in_libero import Done, repeated
+
+    settings, demos = ReplayConfig(), DemosConfig(tasks=(f"{suite}/{task}",))
+    demo = starter_demo(find_task(suite, task))
+    (entry,) = demos.index().entries
+    (twin,) = plan.twins([entry], 0, settings)
+    assert ReplayJob(twin, twin.trajectory_id, demos, settings, tmp_path)().kept
+    strength = level(demo.task, find_task(suite, scene))
+    change = GoalPerturbation(scene=scene, start=0, level=strength)
+    row = plan.row(entry, (change,), 0, settings)
+    assert ReplayJob(row, twin.trajectory_id, demos, settings, tmp_path)().kept
+    trajectory = TrajectoryStore(tmp_path).load(row.trajectory_id)
+    assert trajectory.mode == "tracked"
+    assert from_json(row.perturbations) == (change,)
+    assert task_of(suite, task, row.perturbations).bddl_file.stem == scene
+    text = find_task(suite, scene).bddl_file.read_text()
+    file = tmp_path / f"{scene}.bddl"
+    file.write_text(re.sub(r"\(:goal\s+\(And [^\n]*\n\s+\)", f"(:goal (And {goal}))", text))
+    env = ControlEnv(bddl_file_name=str(file), has_offscreen_renderer=False, use_camera_obs=False, ignore_done=True)
+    done = Done(demo.task, "goal", row.trajectory_id, trajectory.scene, trajectory.states, trajectory.actions)
+    assert repeated(env, done) is None
+    own = ControlEnv(
+        bddl_file_name=str(find_task(suite, scene).bddl_file),
+        has_offscreen_renderer=False,
+        use_camera_obs=False,
+        ignore_done=True,
+    )
+    assert repeated(own, done) == "the goal is not reached", "the scene's own goal is another one"
