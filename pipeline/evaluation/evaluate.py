@@ -70,7 +70,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         raise PipelineError(
             "the replays of demonstrations execute deltas", where="actions", expected="--server or --checkpoint"
         )
-    selected = _not_trained(select(selection, evaluation.archive), settings.plan)
+    selected = not_trained(select(selection, evaluation.archive), settings.plan)
     check_settings(selection, selected, settings)
     evaluation.check(selected)
     faults: dict[EvaluationTask, str] = {}
@@ -100,7 +100,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     return summarised
 
 
-def _not_trained(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
+def not_trained(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
     """Leave out goals that a training plan carries to the same scenes, and print their number."""
     goals = set() if plan is None else own_draws.planned(plan).goals
     left = [task for task in wanted if task.source != "goals" or goal_task(task)[1] not in goals]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from pipeline.errors import PipelineError
 from pipeline.grouping import grouped
+from pipeline.libero.carried import IN_SCENE
 from pipeline.seeding import digest
 from pipeline.types import Episode
 
@@ -61,6 +62,7 @@ class Known(NamedTuple):
         demo: its demonstration, ``<suite>/<task>/<key>``.
         origin: identifier that all demonstrations generated from one human demonstration share.
         instruction: the text that the policy is prompted with.
+        scene: name of the task in whose scene it is carried out, if the demonstration has another scene.
     """
 
     suite: str
@@ -69,6 +71,13 @@ class Known(NamedTuple):
     instruction: str = ""
     steps: int = 0
     origin: str = ""
+    scene: str = ""
+
+    @property
+    def played(self) -> str:
+        """Return ``<suite>/<task>`` of the demonstration, with the scene if that is another one."""
+        task = self.demo.rpartition("/")[0]
+        return f"{task}{IN_SCENE}{self.scene}" if self.scene else task
 
 
 @dataclass(frozen=True)

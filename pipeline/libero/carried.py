@@ -12,7 +12,11 @@ from pathlib import Path
 
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl, Fact
+from pipeline.libero.tasks import find_task
 from pipeline.types import Task
+
+IN_SCENE = "__in__"
+"""Text between the names of a carried task and of its scene in names of files."""
 
 
 class CannotCarryError(ValueError):
@@ -22,6 +26,21 @@ class CannotCarryError(ValueError):
 def carried(task: Task, scene: Task) -> Task:
     """Return ``task`` in the scene of the task ``scene``: instruction and goal of the first, start of the second."""
     return replace(task, bddl_file=scene.bddl_file, goal_file=task.bddl_file)
+
+
+def file_name(task: Task) -> str:
+    """Return the name of a task for files, without suffix; that of a carried task names the scene too."""
+    return task.name if task.goal_file is None else f"{task.name}{IN_SCENE}{task.bddl_file.stem}"
+
+
+def task_named(suite: str, name: str) -> Task:
+    """Return the task with the ``file_name`` ``name``.
+
+    Raises:
+        PipelineError: when the suite has no such task, or no task of this scene.
+    """
+    own, _, scene = name.partition(IN_SCENE)
+    return carried(find_task(suite, own), find_task(suite, scene)) if scene else find_task(suite, own)
 
 
 def definition_of(task: Task) -> Bddl:

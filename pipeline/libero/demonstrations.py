@@ -20,6 +20,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.aliases import as_defined
 from pipeline.libero.assets import package_folder, relocate
+from pipeline.libero.carried import task_named
 from pipeline.libero.recorder import reject_other_control, reject_other_rate
 from pipeline.libero.tasks import SUITES, base_of_test, find_task, suites, tasks
 from pipeline.origins import REINSTALL
@@ -245,7 +246,8 @@ class HDF5Source:
             )
         for path in sorted(folder.glob("*.hdf5")):
             try:
-                find_task(suite, path.name.removesuffix("_demo.hdf5"))
+                # A dataset in this layout also has files of tasks in the scenes of others, which are no demonstrations.
+                task_named(suite, path.name.removesuffix("_demo.hdf5"))
             except PipelineError as error:
                 yield Problem(f"{suite}/{path.name}", PipelineError(error.what, where=path, expected=error.expected))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.assets import package_folder
-from pipeline.libero.carried import bddl_text
+from pipeline.libero.carried import bddl_text, file_name
 from pipeline.types import Floats, Task
 
 GET_AGAIN = (
@@ -212,7 +212,7 @@ def task_attributes(task: Task, frame_px: int = FRAME_PX) -> dict[str, str]:
     bddl = bddl_text(task)
     (problem,) = re.findall(r"\(problem\s+([^()]+)\)", bddl)
     (language,) = re.findall(r"\(:language\s+([^()]+)\)", bddl)
-    bddl_file = f"libero/libero/bddl_files/{task}.bddl"
+    bddl_file = f"libero/libero/bddl_files/{task.suite}/{file_name(task)}.bddl"
     controller = package_folder("robosuite") / "controllers" / "config" / "osc_pose.json"
     env_kwargs = {
         "robots": ["Panda"],

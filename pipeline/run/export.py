@@ -135,7 +135,16 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
         rewrites[episode_id] = wordings(language, row.suite, row.task, row.perturbations)
         content = digest(content, rewrites[episode_id])[:16]
         steps = outcome.trajectories[row.trajectory_id]["steps"]
-        episodes[episode_id] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
+        task = task_of(row.suite, row.task, row.perturbations)
+        episodes[episode_id] = Known(
+            row.suite,
+            content,
+            row.demo_id,
+            row.instruction,
+            steps,
+            row.demo_origin_sha256,
+            task.bddl_file.stem if task.goal_file else "",
+        )
     load = run.episodes(failures=failures, rewrites=rewrites, replays=target.stores_replay)
     return Episodes(episodes, load)
 

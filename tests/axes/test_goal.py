@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from conftest import starter_demo
 
-from pipeline.axes import from_json, task_of
+from pipeline.axes import Axes, from_json, task_of
 from pipeline.axes.goal import GoalAxis, GoalPerturbation, Pair, held_out, level, pairs
-from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.axes.language import LanguageAxis, LanguagePerturbation
+from pipeline.axes.language_goal import changed_goal
+from pipeline.axes.pose import PoseAxis, ScenePerturbation
+from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import bddl
 from pipeline.libero.carried import CannotCarryError, bddl_text, carried, definition_of
 from pipeline.libero.tasks import SUITES, find_task, tasks
@@ -18,6 +21,7 @@ from pipeline.planning import plan
 from pipeline.run.replay_job import ReplayJob
 from pipeline.seeding import rng
 from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.testset import benchmark
 
 PICK, PLATE = "pick_up_the_", "_and_place_it_on_the_plate"
 BASKET = "_and_place_it_in_the_basket"
@@ -167,6 +171,38 @@ def test_draws_are_keyed_and_within_the_configured_levels() -> None:
     assert {one.start for one in drawn} == {0, 1, 2, 3}
     assert {one.scene for one in drawn} == set(axis.entries(milk))
     assert not GoalAxis().applies(tasks("libero_goal")[0])
+
+
+def test_other_axes_perturb_the_task_in_its_scene() -> None:
+    """Rewrites that mean several things there are left out, and things are moved by their names there."""
+    task = find_task("libero_object", f"{PICK}milk{BASKET}")
+    axes = Axes(goal=GoalAxis(), pose=PoseAxis(components=("scene",)), language=LanguageAxis())
+    config = PlanConfig(seed=1, episodes={"goal+pose+language": 12}, axes=axes)
+    rows = plan.make(DemosConfig(tasks=(str(task),)).index().entries, config, ReplayConfig(), benchmark.load())
+    planned = [row for row in rows if row.role == "perturbed" and row.wanted]
+    assert len(planned) == 12
+    assert len({row.trajectory_id for row in rows}) == len(rows)
+    for row in planned:
+        goal, pose, language = from_json(row.perturbations)
+        assert isinstance(goal, GoalPerturbation)
+        assert isinstance(pose, ScenePerturbation)
+        assert isinstance(language, LanguagePerturbation)
+        scene = find_task("libero_object", goal.scene)
+        assert (row.task, row.instruction) == (task.name, language.text)
+        assert {move.name for move in pose.moves} == set(bddl.read(scene.bddl_file).places)
+        assert changed_goal(row.instruction, carried(task, scene), hints=True) is None
+        assert row.reset_seed == goal.reset_seed
+
+
+def test_a_rewrite_that_means_two_things_of_the_scene_is_left_out() -> None:
+    """A can is soup or tomato sauce where both stand."""
+    left_out = 0
+    for pair in usable("libero_object"):
+        own, there = (set(LanguageAxis().entries(task)) for task in (pair.task, pair.played))
+        assert there <= own
+        assert len(there) > 10
+        left_out += len(own - there)
+    assert left_out > 0
 
 
 @pytest.mark.slow

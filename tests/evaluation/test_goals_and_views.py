@@ -2,18 +2,24 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import STOVE
 
+from pipeline.axes.goal import GoalPerturbation, held_out
+from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.evaluate import not_trained
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.tasks import EvaluationTask, find_replacement, replacements
+from pipeline.evaluation.tasks import CARRIED, EvaluationTask, find_replacement, goal_task, replacements
 from pipeline.libero import bddl
+from pipeline.libero.carried import carried, definition_of
 from pipeline.libero.tasks import SUITES, find_task, tasks
+from pipeline.planning import plan
 from pipeline.types import Floats
 
 
@@ -41,6 +47,8 @@ def test_goals_are_replaced_by_what_fits_and_is_named_alone() -> None:
 
 def test_a_goal_task_changes_nothing_but_its_goal() -> None:
     for task in select(Selection(source="goals")):
+        if CARRIED in task.name:
+            continue
         base = find_task(task.suite, task.base)
         replacement = find_replacement(base, task.name)
         ours, theirs = bddl.parse(replacement.bddl_text(base), task.name), bddl.read(base.bddl_file)
@@ -51,6 +59,51 @@ def test_a_goal_task_changes_nothing_but_its_goal() -> None:
         assert replacement.instruction != base.instruction
     with pytest.raises(PipelineError, match="no goal"):
         find_replacement(base, "put_the_moon_on_the_plate_goal_a_b_state0")
+
+
+def test_held_out_pairs_are_goals_of_their_scenes() -> None:
+    """The object suite's are replaced goals already, with another wording."""
+    listed = select(Selection(source="goals", suites=SUITES))
+    carried_to = {(task.suite, task.base, task.name) for task in listed if CARRIED in task.name}
+    expected = set()
+    for suite in ("libero_spatial", "libero_10", "libero_90"):
+        for task, scene in held_out(suite):
+            expected.add((suite, scene.name, f"{scene.name}_task_{task.name}_state0"))
+    assert carried_to == expected
+    assert len(expected) == 3
+    replaced = {goal_task(task)[1] for task in listed if CARRIED not in task.name}
+    assert not replaced & {goal_task(task)[1] for task in listed if CARRIED in task.name}
+    assert {definition_of(carried(task, scene)).asked for task, scene in held_out("libero_object")} <= replaced
+
+
+def test_goals_that_a_plan_trains_on_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    milk = find_task("libero_object", "pick_up_the_milk_and_place_it_in_the_basket")
+    soup = find_task("libero_object", "pick_up_the_alphabet_soup_and_place_it_in_the_basket")
+    (entry,) = DemosConfig(tasks=(str(milk),)).index().entries
+    change = GoalPerturbation(scene=soup.name, start=0, level=3)
+    plan.write([plan.row(entry, (change,), 0, ReplayConfig())], tmp_path / "plan.parquet")
+    wanted = select(Selection(source="goals", suites=("libero_object",)))
+    left = not_trained(wanted, tmp_path / "plan.parquet")
+    (out,) = set(wanted) - set(left)
+    assert (out.base, out.component) == (soup.name, "milk")
+    assert capsys.readouterr().out == "left out, because the plan trains on them: 1 of 50 goals\n"
+    assert not_trained(wanted, None) == wanted
+
+
+@pytest.mark.slow
+def test_a_held_out_pair_begins_in_the_scene_and_asks_for_the_other_task() -> None:
+    task = next(task for task in select(Selection(source="goals", suites=("libero_spatial",))) if CARRIED in task.name)
+    evaluated = EpisodeEnvironment()
+    clean = replace(task, source="libero", name=f"{task.base}_state0", axis="clean", component="clean", level=0)
+    evaluated.reset(clean)
+    usual, told = evaluated.image("agentview"), evaluated.instruction
+    evaluated.reset(task)
+    assert np.array_equal(evaluated.image("agentview"), usual)
+    asked = task.name.partition(CARRIED)[2].removesuffix("_state0")
+    assert evaluated.instruction == find_task("libero_spatial", asked).instruction != told
+    bowl, plate = (evaluated.simulator.pose(name) for name in ("akita_black_bowl_2", "plate_1"))
+    assert np.linalg.norm(bowl[:2] - plate[:2]) > 0.05
+    assert not evaluated.progress.success
 
 
 NOUNS = {

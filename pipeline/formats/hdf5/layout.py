@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import ALL_VIEWS
-from pipeline.libero.tasks import find_task
+from pipeline.libero.carried import task_named
 from pipeline.types import Floats, Task
 
 VALIDATION_FOLDER = "val"
@@ -27,7 +27,7 @@ A start without posture or push lacks the attribute.
 
 
 def file_of(task: str, split: str) -> str:
-    """Return the path of a task's file below the folder of the dataset; ``task`` is ``<suite>/<task>``."""
+    """Return the path of a task's file below the folder of the dataset; ``task`` is ``<suite>/<file_name>``."""
     folder = "" if split == "train" else f"{VALIDATION_FOLDER}/"
     return f"{folder}{task}{SUFFIX}"
 
@@ -38,7 +38,7 @@ def task_of(file: Path) -> Task:
     Raises:
         PipelineError: when no task has the file's name.
     """
-    return find_task(file.parent.name, file.name.removesuffix(SUFFIX))
+    return task_named(file.parent.name, file.name.removesuffix(SUFFIX))
 
 
 def camera(view: str) -> str:
