@@ -94,7 +94,7 @@ def test_every_field_is_described(model: type[BaseModel]) -> None:
         ({"camera": 0, "noise": 1, "language": 1}, ("plan", "episodes"), "plan.episodes.camera"),
         ({"axes": {"pose": {}}, "episodes": {"camera": 4}}, ("plan",), "axes and episodes must name the same axes"),
         ({"camera+camera": 4}, ("plan", "episodes"), "plan.episodes: 'camera+camera' names an axis twice"),
-        ({"camera+wind": 4}, ("plan", "episodes"), "'wind' in 'camera+wind' is no axis, expected layout, pose"),
+        ({"camera+wind": 4}, ("plan", "episodes"), "'wind' in 'camera+wind' is no axis, expected goal, layout, pose"),
         ({"camera+": 4}, ("plan", "episodes"), "'' in 'camera+' is no axis"),
         (
             {"camera+light": 4, "light+camera": 2},
@@ -116,7 +116,7 @@ def test_every_field_is_described(model: type[BaseModel]) -> None:
         ({"robot": {"norm_rad": [0.1, 0.2, 0.3, 0.4, math.inf]}}, ("plan", "axes"), "finite number"),
         (2**63, ("plan", "seed"), "plan.seed: expected less than"),
         ({"camera": 10**9}, ("plan", "episodes"), "plan.episodes.camera: expected at most 1000000, got 1000000000"),
-        ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: unknown field; the fields are layout, pose"),
+        ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: unknown field; the fields are goal, layout, pose"),
         ({"source": "starter", "root": "/tmp"}, ("demos",), "source: hdf5 and root require each other"),
         ({"source": "hdf5"}, ("demos",), "source: hdf5 and root require each other"),
         ({"tasks": ["libero_goal/put_the_bowl_on_the_plat"]}, ("demos",), "libero_goal/put_the_bowl_on_the_plate"),

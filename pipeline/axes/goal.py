@@ -162,8 +162,9 @@ class GoalAxis(Axis):
         return [scene.name for scene in _trained(task) if level(task, scene) in self.levels]
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> GoalPerturbation:
-        """Return the scene at ``place`` of ``entries`` with one of its starts."""
-        scene = find_task(task.suite, self.entries(task)[place])
+        """Return the scene at ``place`` of ``entries``, which start again at their end, with one of its starts."""
+        scenes = self.entries(task)
+        scene = find_task(task.suite, scenes[place % len(scenes)])
         start = int(rng.integers(self.starts))
         return GoalPerturbation(scene=scene.name, start=start, level=level(task, scene))
 
@@ -171,4 +172,4 @@ class GoalAxis(Axis):
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[GoalPerturbation]], test: TestSet) -> CoveragePlots:
         """Describe the plot of the levels."""
         levels = {"episodes": {"goal": np.array([item.perturbation.level for item in kept], float)}}
-        return CoveragePlots("The benchmark has no such test.", [Strips("level", levels, "level")])
+        return CoveragePlots(f"{len(test.on_axis(cls.name())):,} test tasks.", [Strips("level", levels, "level")])

@@ -136,7 +136,7 @@ def test_a_preview_names_axes_in_any_order() -> None:
     words = ["preview", "libero_goal/*", "--out", "a.png"]
     assert parse([*words, "noise+camera"]).params["axis"] == "camera+noise"
     assert parse([*words, "all"]).params["axis"] == "all"
-    with pytest.raises(click.UsageError, match=r"'cameras' in 'noise\+cameras' is no axis, expected layout, "):
+    with pytest.raises(click.UsageError, match=r"'cameras' in 'noise\+cameras' is no axis, expected goal, layout, "):
         parse([*words, "noise+cameras"])
 
 

@@ -12,12 +12,16 @@ from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.errors import RefusedError
+from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.types import Demo, Floats, Scene
 
 MOVED = PosePerturbation(component="target", level=2, moved="plate_1", dx_m=0.01, dy_m=-0.02, dyaw_deg=5)
+COOKIES = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate")
+"""A task that every axis can change."""
+
 TURNED = RobotPerturbation(
     component="initial_joints", level=1, joint_offsets_rad=(0.05, 0.03, 0.04, 0.05, 0.02, 0.03, 0.05)
 )
@@ -61,9 +65,9 @@ def pose_of(body: str, scene: Scene) -> Floats:
 
 
 def test_axes_stand_in_the_order_of_their_layers() -> None:
-    drawn = [axis().sample(seeding.rng(1, name), PLATE, 0) for name, axis in AXES.items()]
+    drawn = [axis().sample(seeding.rng(1, name), COOKIES, 0) for name, axis in AXES.items()]
     assert [p.axis for p in drawn] == list(AXES)
-    assert [p.axis for p in drawn][:3] == ["layout", "pose", "robot"]
+    assert [p.axis for p in drawn][:4] == ["goal", "layout", "pose", "robot"]
     assert [p.layer for p in drawn] == sorted((p.layer for p in drawn), reverse=True)
     assert in_order(drawn[::-1]) == from_json(to_json(drawn[::-1])) == tuple(drawn)
 

@@ -33,6 +33,9 @@ from pipeline.seeding import rng
 from pipeline.testset import benchmark
 from pipeline.types import Jpeg, Quality
 
+ON_COOKIES = "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate"
+"""A task that every axis can change."""
+
 LIMIT_BYTES = 15_000_000
 
 
@@ -181,7 +184,7 @@ def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
 
 @pytest.mark.parametrize("name", sorted(AXES))
 def test_every_axis_has_a_picture_of_where_its_draws_lie(name: str) -> None:
-    task = find_task("libero_goal", "put_the_bowl_on_the_plate")
+    task = find_task("libero_spatial", ON_COOKIES)
     draws = [KeptPerturbation(task, _draw(name, variant), None) for variant in range(30)]
     shown = coverage.plot_axis(name, draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert shown.panels
@@ -228,7 +231,7 @@ def test_a_browser_shows_it(html: str, width_px: int, tmp_path: Path) -> None:
 
 
 def _draw(name: str, variant: int) -> Perturbation:
-    task = find_task("libero_goal", "put_the_bowl_on_the_plate")
+    task = find_task("libero_spatial", ON_COOKIES)
     return AXES[name]().sample(rng(3, name, variant), task, variant)
 
 

@@ -70,7 +70,7 @@ def worded(task: Task, text: str, bank: Path | None = None) -> list[str]:
     """What `validate` finds wrong with an instruction; of a bank, it is one of its rewrites."""
     drawn = [one for one in deal(task, bank=bank) if one.text == text] if bank else []
     row = {"suite": task.suite, "task": task.name, "instruction": text, "perturbations": to_json(drawn)}
-    case: Any = SimpleNamespace(row=row, bank=bank, finding=lambda *told: told[1])
+    case: Any = SimpleNamespace(row=row, task=task, bank=bank, finding=lambda *told: told[1])
     found: Any = checks.wording(case)
     return list(found)
 
