@@ -123,7 +123,8 @@ def checks() -> dict[str, Any]:
         decoded={**decoded, **swapped},
         marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
         place={"place": 2},
-        said=[[{"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1"}]] * steps,
+        said=[[{"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1", "camera": None}]] * steps,
+        events=[[{"role": "assistant", "style": "trace", "content": "{}", "camera": "image"}]] * steps,
         statistics=Statistics(
             {"state": {name: [0.5] * 8 for name in FIGURES} | {"count": [1]}},
             {"state": made.state},
