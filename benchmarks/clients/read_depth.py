@@ -18,11 +18,8 @@ import numpy as np
 import pyarrow.parquet as pq
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-COLUMNS = {
-    "observation.images.image_depth": "camera.agent.depth",
-    "observation.images.image2_depth": "camera.wrist.depth",
-}
-"""Column of a video to the column of the same maps as text."""
+CAMERAS = {"image": "agent", "image2": "wrist"}
+"""Name of a view to the camera in the columns of text; further views have the same name in both."""
 
 BOUNDS_M = (0.0, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 6.5536)
 
@@ -30,7 +27,11 @@ BOUNDS_M = (0.0, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 6.5536)
 def main(video: Path, text: Path) -> None:
     dataset = LeRobotDataset(video.name, root=video, video_backend="pyav", depth_output_unit="m")
     ids = pq.read_table(video / "meta" / "provenance.parquet")["episode_id"].to_pylist()
-    names = ["episode_id", "frame_index", *COLUMNS.values()]
+    columns: dict[str, str] = {}  # column of a video to the column of the same maps as text
+    for key in dataset.meta.depth_keys:
+        view = key.removeprefix("observation.images.").removesuffix("_depth")
+        columns[key] = f"camera.{CAMERAS.get(view, view)}.depth"
+    names = ["episode_id", "frame_index", *columns.values()]
     stored = {}
     for file in sorted((text / "data").rglob("*.parquet")):
         for row in pq.read_table(file, columns=names).to_pylist():
@@ -43,7 +44,7 @@ def main(video: Path, text: Path) -> None:
     for index in range(len(dataset)):
         item = dataset[index]
         row = stored[ids[int(item["episode_index"])], int(item["frame_index"])]
-        for read_column, column in COLUMNS.items():
+        for read_column, column in columns.items():
             packed = np.frombuffer(base64.b64decode(row[column]), np.uint8)
             expected_m = np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED)) / 10_000
             errors_m = np.abs(item[read_column].numpy()[0] - expected_m)
@@ -65,7 +66,7 @@ def main(video: Path, text: Path) -> None:
                 "max_mm": round(1000 * largest_m[place], 3),
             }
         )
-    print(json.dumps({"maps": 2 * len(dataset), "ranges": ranges}, indent=1))
+    print(json.dumps({"columns": columns, "maps": len(columns) * len(dataset), "ranges": ranges}, indent=1))
 
 
 if __name__ == "__main__":

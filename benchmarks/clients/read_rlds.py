@@ -9,7 +9,8 @@ this project. DLIMP is a checkout of moojink/dlimp_openvla. ROOT is a dataset su
 
 ``prismatic/__init__.py`` and ``prismatic/vla/__init__.py`` import all models, so these two files are skipped; every
 other module is the checkout's own. The loader writes a file into the dataset, so it reads a copy. Steps are read with
-TFDS alone for the comparison. The last line is JSON.
+TFDS alone for the comparison; both views are compared at the first and the last step of each episode. The last line is
+JSON.
 """
 
 import importlib
@@ -24,6 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+VIEWS = {"image_primary": "image", "image_wrist": "wrist_image"}
+"""Name of each view in OFT's samples to its name in the dataset."""
 
 sys.argv.append("libero")  # OFT takes its constants from the arguments
 
@@ -48,13 +52,15 @@ def written(root: Path) -> dict[str, list[Any]]:
     tfds: Any = importlib.import_module("tensorflow_datasets")
     builder = tfds.builder_from_directory(str(root / "1.0.0"))
     order = tfds.ReadConfig(interleave_cycle_length=1)
-    columns: dict[str, list[Any]] = {name: [] for name in ("action", "action_absolute", "state", "image", "text")}
+    names = ("action", "action_absolute", "state", "image", "wrist_image", "text")
+    columns: dict[str, list[Any]] = {name: [] for name in names}
     for episode in tfds.as_numpy(builder.as_dataset(split="train", shuffle_files=False, read_config=order)):
         steps = list(episode["steps"])
         columns["action"].append(np.stack([step["action"] for step in steps]))
         columns["action_absolute"].append(np.stack([step["action_absolute"] for step in steps]))
         columns["state"].append(np.stack([step["observation"]["state"] for step in steps]))
-        columns["image"].append(steps[0]["observation"]["image"])
+        for view in ("image", "wrist_image"):
+            columns[view].append(np.stack([step["observation"][view] for step in steps[:: len(steps) - 1]]))
         columns["text"].append(steps[0]["language_instruction"])
     return columns
 
@@ -85,7 +91,7 @@ def main(root: Path) -> None:
             apart = np.abs(statistics[column][name] - np.quantile(values, share, axis=0))
             differences[f"{column} {name}"] = float(apart.max())
 
-    differences |= dict.fromkeys(("action", "proprio", "image"), 0.0)
+    differences |= dict.fromkeys(("action", "proprio", *VIEWS), 0.0)
     tensorflow: Any = importlib.import_module("tensorflow")
     for number, episode in enumerate(dataset.iterator()):
         assert (episode["task"]["language_instruction"] == steps["text"][number]).all()
@@ -97,8 +103,11 @@ def main(root: Path) -> None:
             if column == "action":
                 expected[:, 6] = values[:, 6]
             differences[column] = max(differences[column], float(np.abs(read - expected).max()))
-        image = tensorflow.io.decode_image(episode["observation"]["image_primary"][0]).numpy().astype(float)
-        differences["image"] = max(differences["image"], float(np.abs(image - steps["image"][number]).max()))
+        for view, column in VIEWS.items():
+            for place, frame in zip((0, -1), steps[column][number], strict=True):
+                image = tensorflow.io.decode_image(episode["observation"][view][place]).numpy().astype(float)
+                differences[view] = max(differences[view], float(np.abs(image - frame).max()))
+        assert set(episode["observation"]) == {*VIEWS, "proprio", "timestep"}
         assert set(episode) == {"observation", "task", "action", "dataset_name", "absolute_action_mask"}
     figures = {"root": root.name, "episodes": number + 1, "steps": len(columns["action"])}
     figures |= {"transitions": int(statistics["num_transitions"]), "largest_difference": differences}

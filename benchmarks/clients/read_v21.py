@@ -41,12 +41,14 @@ from PIL import Image
 
 Sample = dict[str, Any]
 """``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``; samples from
-files also have ``absolute_action``, ``episode`` and ``step``."""
+files also have ``absolute_action``, ``episode`` and ``step``, and all other columns by their own names."""
 
 EXTRA_DELTA = "--data.extra-delta-transform"
 """openpi's option that subtracts the state from the first six numbers of an action."""
 
 NUMBERS = ("state", "action", "absolute_action")
+
+LABELS = ("subtask_starts", "subtask_texts", "rewrites")
 
 SIZE = 224
 """Height and width to which starVLA and openpi resize."""
@@ -60,18 +62,23 @@ def files(root: Path) -> Iterator[tuple[int, Sample]]:
     names |= {"wrist_image": "observation.images.wrist_image", "absolute_action": "absolute_action"}
     if "actions" in info["features"]:
         names = {name: name for name in names} | {"action": "actions"}
+    others = [name for name in info["features"] if name not in names.values()]
     before = 0
     for episode in range(info["total_episodes"]):
         place = {"episode_chunk": episode // info["chunks_size"], "episode_index": episode}
         rows = pq.read_table(root / info["data_path"].format(**place)).to_pylist()
         for step in (0, len(rows) // 2, len(rows) - 1):
             sample: Sample = {name: np.array(rows[step][names[name]]) for name in NUMBERS}
-            for view in ("image", "wrist_image"):
-                if info["video_path"] is None:
-                    sample[view] = _opened(rows[step][names[view]]["bytes"])
+            for name in ("image", "wrist_image", *others):
+                column = names.get(name, name)
+                if info["features"][column]["dtype"] == "image":
+                    sample[name] = _opened(rows[step][column]["bytes"])
+                elif info["features"][column]["dtype"] == "video":
+                    sample[name] = _shown(root / info["video_path"].format(video_key=column, **place), step)
                 else:
-                    sample[view] = _shown(root / info["video_path"].format(video_key=names[view], **place), step)
-            sample |= {"text": tasks[rows[step]["task_index"]]["task"], "episode": episode, "step": step}
+                    sample[name] = rows[step][column]
+            sample["text"] = sample["task"] = tasks[rows[step]["task_index"]]["task"]
+            sample |= {"episode": episode, "step": step}
             yield before + step, sample
         before += len(rows)
 
@@ -86,15 +93,22 @@ def _shown(file: Path, step: int) -> Any:
 
 
 def lerobot(root: Path) -> Iterator[tuple[Sample, Sample]]:
-    """Read samples with lerobot 0.3.3; yield them with the expected ones."""
+    """Read samples with lerobot 0.3.3, all columns and labels of them; yield them with the expected ones."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = LeRobotDataset(root.name, root=root, video_backend="pyav")
+    lines = (root / "meta" / "episodes.jsonl").read_text().splitlines()
+    short = {"observation.state": "state", "actions": "action"}
+    short |= {f"observation.images.{view}": view for view in ("image", "wrist_image")}
     for place, expected in files(root):
-        item = {name.rpartition(".")[2].removesuffix("s"): value for name, value in dataset[place].items()}
-        read = {name: item[name].numpy() for name in NUMBERS}
-        read |= {view: item[view].numpy().transpose(1, 2, 0) * 255 for view in ("image", "wrist_image")}
-        yield {**read, "text": item["task"]}, expected
+        read: Sample = {}
+        for name, value in dataset[place].items():
+            if name in dataset.meta.camera_keys:
+                value = value.numpy().transpose(1, 2, 0) * 255
+            read[short.get(name, name)] = value
+        labels = dataset.meta.episodes[expected["episode"]]
+        written = json.loads(lines[expected["episode"]])
+        yield read | {name: labels[name] for name in LABELS}, expected | {name: written[name] for name in LABELS}
 
 
 def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
@@ -208,14 +222,18 @@ def main() -> None:
     readers: dict[str, Callable[..., Iterator[tuple[Sample, Sample]]]]
     readers = {"lerobot": lerobot, "starvla": starvla, "openpi": openpi, "gr00t": gr00t}
     furthest: dict[str, float] = {}
+    equal: set[str] = set()
     samples = 0
     for read, expected in readers[client](Path(root).resolve(), *further):
-        assert read["text"] == expected["text"], f"{read['text']!r} for {expected['text']!r}"
-        for name in read.keys() - {"text"}:
+        for name in read:
+            if isinstance(read[name], str | list):
+                assert read[name] == expected[name], f"{name}: {read[name]!r} for {expected[name]!r}"
+                equal.add(name)
+                continue
             apart = np.abs(np.asarray(read[name], float) - np.asarray(expected[name], float))
             furthest[name] = max(furthest.get(name, 0.0), float(apart.max()))
         samples += 1
-    print(f"{client}: {samples} steps of {root}; largest difference: {furthest}")
+    print(f"{client}: {samples} steps of {root}; equal: {sorted(equal)}; largest difference: {furthest}")
 
 
 if __name__ == "__main__":

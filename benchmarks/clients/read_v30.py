@@ -4,8 +4,9 @@ The script runs in lerobot's environment, which has neither this project nor its
 
     ENV/bin/python benchmarks/clients/read_v30.py ROOT
 
-Every number of every step is compared, and both views of the first, the middle and the last step of each episode. The
-last printed line is JSON: the steps, the columns and the largest differences.
+Every number of every step is compared, and the labels of every episode. Of the first, the middle and the last step of
+each episode, all views, texts (such as maps) and language columns are compared; ``read_depth.py`` compares depth as
+video. The last printed line is JSON: the steps, the columns and the largest differences.
 """
 
 import io
@@ -21,7 +22,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
-VIEWS = ("observation.images.image", "observation.images.image2")
+LABELS = ("subtask_starts", "subtask_texts", "rewrites")
 
 
 def frames_of(root: Path, episode: dict[str, Any], view: str) -> list[Any]:
@@ -45,8 +46,11 @@ def main(root: Path) -> None:
     for file in sorted(root.glob("data/*/*.parquet")):
         rows += pq.read_table(file).to_pylist()
     tasks = {row["task_index"]: row["task"] for row in tables(root / "meta" / "tasks.parquet")}
-    columns = [name for name, spec in info["features"].items() if spec["dtype"] == "float32" and name != "timestamp"]
-    furthest = dict.fromkeys((*columns, *VIEWS), 0.0)
+    specs = info["features"]
+    columns = [name for name, spec in specs.items() if spec["dtype"] == "float32" and name != "timestamp"]
+    texts = [name for name, spec in specs.items() if spec["dtype"] in ("string", "language")]
+    views = [name for name in specs if name.startswith("observation.images.") and not name.endswith("_depth")]
+    furthest = dict.fromkeys((*columns, *views), 0.0)
 
     numbers = dataset.hf_dataset.with_format("numpy")
     for name in columns:
@@ -56,21 +60,24 @@ def main(root: Path) -> None:
 
     for episode in tables(root / "meta" / "episodes"):
         length, first = episode["length"], episode["dataset_from_index"]
+        labels = dataset.meta.episodes[episode["episode_index"]]
+        assert all(list(labels[name]) == list(episode[name]) for name in LABELS)
         written_frames = {}
-        if info["features"][VIEWS[0]]["dtype"] == "video":
-            written_frames = {view: frames_of(root, episode, view) for view in VIEWS}
+        if specs[views[0]]["dtype"] == "video":
+            written_frames = {view: frames_of(root, episode, view) for view in views}
         for step in (0, length // 2, length - 1):
             item, row = dataset[first + step], rows[first + step]
             assert item["task"] == tasks[row["task_index"]]
-            for view in VIEWS:
+            assert all(item[name] == row[name] for name in texts)
+            for view in views:
                 if written_frames:
                     frame = written_frames[view][step]
                 else:
                     frame = np.array(Image.open(io.BytesIO(row[view]["bytes"])))
                 apart = np.abs(item[view].numpy().transpose(1, 2, 0) * 255 - frame)
                 furthest[view] = max(furthest[view], float(apart.max()))
-    figures = {"lerobot": version("lerobot"), "root": root.name, "steps": len(rows), "largest_difference": furthest}
-    print(json.dumps(figures))
+    figures = {"lerobot": version("lerobot"), "root": root.name, "steps": len(rows), "equal": [*texts, *LABELS]}
+    print(json.dumps({**figures, "largest_difference": furthest}))
 
 
 def tables(path: Path) -> list[dict[str, Any]]:
