@@ -5,6 +5,7 @@
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
@@ -14,7 +15,7 @@ from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
-from pipeline.libero.starts import kept_actions, recorded_start
+from pipeline.libero.starts import LEFT_OUT_STEPS, kept_actions, recorded_start
 from pipeline.machine_code import fixed_machine_code
 from pipeline.physics.environment import Environment, UnusableSceneError, shared
 from pipeline.physics.reference import Reference
@@ -176,6 +177,13 @@ def roll_out(scene: Scene, demo: Demo, replay_config: ReplayConfig = ReplayConfi
     """
     actions = demo.actions[kept_actions(demo.actions, replay_config.noops)]
     return _states_from(scene, demo.task, actions, replay_config)
+
+
+def at_reset(environment: Environment, demo: Demo, seed: int) -> Demo:
+    """Return the demonstration as if recorded from another reset; LIBERO's recordings begin with an open gripper."""
+    model_xml = environment.reset(seed)
+    environment.settle(LEFT_OUT_STEPS)
+    return replace(demo, init_state=environment.state, states=None, model_xml=model_xml)
 
 
 def first_look(scene: Scene, task: Task, replay_config: ReplayConfig) -> Floats:

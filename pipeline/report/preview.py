@@ -5,7 +5,7 @@ push of a combination at its end. A plan with the same seed samples the same per
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
@@ -24,7 +24,7 @@ from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import first_look, replay, roll_out
+from pipeline.physics.replay import at_reset, first_look, replay, roll_out
 from pipeline.planning.plan import Draws
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
@@ -69,18 +69,29 @@ class Stage:
         Raises:
             RefusedError: when a perturbation is impossible in this scene.
         """
-        scene = self.scene
+        demo, scene = self._start(perturbations)
         for physics in of_layer(perturbations, PhysicsPerturbation):
-            scene = physics.apply(scene, self.demo, partial(roll_out, replay_config=self.replay))
+            scene = physics.apply(scene, demo, partial(roll_out, replay_config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
         push = scene.push
         if push is None:
-            state = first_look(scene, self.demo.task, self.replay)
+            state = first_look(scene, demo.task, self.replay)
         else:
-            states = roll_out(scene, self.demo, self.replay)
+            states = roll_out(scene, demo, self.replay)
             state = states[min(push.first_step + push.steps + AFTER_PUSH_STEPS, len(states) - 1)]
         streams = [Stream(view, perturbations) for view in views]
         return frames_of(renderer, state, renderer.site_alpha, streams, 0)
+
+    def _start(self, perturbations: Sequence[Perturbation]) -> tuple[Demo, Scene]:
+        """Return the demonstration and its scene, or those of a reset of the scene that it is carried to."""
+        task = self.demo.task
+        for perturbation in perturbations:
+            task = perturbation.played(task)
+            seed = perturbation.reset_seed
+            if seed is not None:
+                demo = at_reset(shared(task), replace(self.demo, task=task), seed)
+                return demo, recorded_start(demo, str(demo.model_xml), settles=self.replay.settle_steps > 0)
+        return self.demo, self.scene
 
     @cached_property
     def _twin(self) -> Trajectory:

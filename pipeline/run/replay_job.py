@@ -12,11 +12,11 @@ from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
 from pipeline.libero.carried import all_counterparts
-from pipeline.libero.starts import LEFT_OUT_STEPS, kept_actions
-from pipeline.physics.environment import Environment, shared
+from pipeline.libero.starts import kept_actions
+from pipeline.physics.environment import shared
 from pipeline.physics.quality import measure
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay
+from pipeline.physics.replay import at_reset, replay
 from pipeline.planning.plan import Row
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Demo, Scene, Task, Trajectory, Verdict
@@ -59,7 +59,7 @@ class ReplayJob:
         seed = self.row.reset_seed
         if seed is not None:
             # Open-loop actions would succeed by luck, and teach that object positions do not matter.
-            start = _at_reset(environment, start, seed)
+            start = at_reset(environment, start, seed)
             replay_config = replay_config.model_copy(update={"mode": "tracked"})
         trajectory = replay(environment, start, self.row.trajectory_id, replay_config, physics, reference)
         # Open-loop actions do not work against a push either.
@@ -112,13 +112,6 @@ class ReplayJob:
         )
         TrajectoryStore(self.folder).save(trajectory)
         return trajectory.verdict
-
-
-def _at_reset(environment: Environment, demo: Demo, seed: int) -> Demo:
-    """Return the demonstration as if recorded from another reset; LIBERO's recordings begin with an open gripper."""
-    model_xml = environment.reset(seed)
-    environment.settle(LEFT_OUT_STEPS)
-    return replace(demo, init_state=environment.state, states=None, model_xml=model_xml)
 
 
 @lru_cache(maxsize=1)

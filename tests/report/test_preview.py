@@ -28,6 +28,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.images.jpeg import decode, encode
 from pipeline.libero.demonstrations import DemoEntry
+from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
@@ -44,12 +45,13 @@ if TYPE_CHECKING:
 
 STARTER = load(REPOSITORY / "configs" / "starter.yaml")
 VIEWS = tuple(SCHEMA.views)
+COOKIES = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate")
 NO_TESTS = TestSet(())
 
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[preview.Stage]:
-    # Its task has something to move, so that every axis applies.
+    # Its task has something to move, so that all axes but goal apply.
     yield preview.staged([BOWL], STARTER)
     scene_of_process().close()
 
@@ -112,6 +114,8 @@ def tiles(sheet: Image.Image, views: int) -> list[Frame]:
 def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_it_was(
     stage: preview.Stage, name: str
 ) -> None:
+    if not AXES[name]().applies(stage.demo.task):
+        stage = preview.staged([COOKIES], STARTER)
     before = stage.frames(VIEWS)
     for perturbation in reversed(preview.variants(name, preview.configured(name, STARTER), stage.demo, 1, NO_TESTS)):
         try:
