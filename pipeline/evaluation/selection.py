@@ -143,11 +143,12 @@ def _check_names(selection: Selection) -> None:
         for axis in selection.axes:
             reason = AXES[axis].not_held_out if axis in AXES else ""
             if reason:
+                tests = f"use --source libero_plus --axis {axis}: test tasks, from which plans keep their clearance"
                 raise PipelineError(
                     f"{axis} has no held-out perturbations: {reason}",
                     where="axes",
                     expected=" or ".join(OWN_AXES),
-                    remedy=f"use --source libero_plus --axis {axis}: test tasks, from which plans keep their clearance",
+                    remedy=tests if AXES[axis].dimension else f"leave {axis} out",
                 )
         _check_known("axes", selection.axes, OWN_AXES, selection)
         _check_known("levels", selection.levels, LEVELS, selection)
