@@ -4,8 +4,8 @@ The script runs in lerobot's environment, which has neither this project nor its
 
     ENV/bin/python benchmarks/clients/read_v30.py ROOT
 
-Every number of every step is compared, and the labels of every episode. Of the first, the middle and the last step of
-each episode, all views, texts (such as maps) and language columns are compared; ``read_depth.py`` compares depth as
+Every number of every step is compared, and the labels of every episode. All views, texts (such as maps) and language
+columns are compared at the first, the middle and the last step of each episode. ``read_depth.py`` compares depth as
 video. The last printed line is JSON: the steps, the columns and the largest differences.
 """
 
