@@ -12,7 +12,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from pipeline.axes.goal import GoalPerturbation, held_out, level, pairs
+from pipeline.axes.goal import GoalPerturbation, held_out, level, usable
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.libero.tasks import SUITES
 from pipeline.machine_code import ensure_fixed_machine_code
@@ -38,8 +38,8 @@ def yields(suite: str, start: int, folder: Path) -> dict[str, object]:
     """Replay all pairs of a suite, and count them."""
     reasons: Counter[str] = Counter()
     settings = ReplayConfig()
-    usable = [pair for pair in pairs(suite) if not pair.left_out]
-    for pair in sorted(usable, key=lambda pair: str(pair.task)):
+    tried = usable(suite)
+    for pair in sorted(tried, key=lambda pair: str(pair.task)):
         demos = DemosConfig(tasks=(str(pair.task),))
         (entry,) = demos.index().entries
         (twin,) = plan.twins([entry], 0, settings)
@@ -50,7 +50,7 @@ def yields(suite: str, start: int, folder: Path) -> dict[str, object]:
         reasons[verdict.reason] += 1
         held = " (held out)" if (pair.task, pair.scene) in held_out(suite) else ""
         print(f"{verdict.reason}: {pair.task} in {pair.scene.name}{held}", flush=True)
-    return {"pairs": len(usable), "kept": reasons["kept"], "reasons": dict(reasons)}
+    return {"pairs": len(tried), "kept": reasons["kept"], "reasons": dict(reasons)}
 
 
 if __name__ == "__main__":

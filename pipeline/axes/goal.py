@@ -66,6 +66,11 @@ def pairs(suite: str) -> tuple[Pair, ...]:
     return tuple(listed)
 
 
+def usable(suite: str) -> list[Pair]:
+    """List the pairs of a suite that are not left out, in the order of ``pairs``."""
+    return [pair for pair in pairs(suite) if not pair.left_out]
+
+
 def _fault(task: Task, scene: Task) -> str:
     """Return the reason why a task cannot be carried to a scene, or an empty text."""
     place = bddl.read(scene.bddl_file).scene
@@ -84,16 +89,15 @@ def _fault(task: Task, scene: Task) -> str:
 @cache
 def held_out(suite: str) -> frozenset[tuple[Task, Task]]:
     """Return the pairs (task, scene) that no plan uses: a fixed fifth of the suite's pairs, chosen by a hash."""
-    usable = [pair for pair in pairs(suite) if not pair.left_out]
-    usable.sort(key=lambda pair: seeding.digest("held-out goal", str(pair.task), str(pair.scene)))
-    return frozenset((pair.task, pair.scene) for pair in usable[: round(len(usable) / HELD_OUT)])
+    shuffled = sorted(usable(suite), key=lambda pair: seeding.digest("held-out goal", str(pair.task), str(pair.scene)))
+    return frozenset((pair.task, pair.scene) for pair in shuffled[: round(len(shuffled) / HELD_OUT)])
 
 
 @cache
 def _trained(task: Task) -> tuple[Task, ...]:
     """List the scenes to which plans carry a task."""
-    usable = [pair for pair in pairs(task.suite) if pair.task == task and not pair.left_out]
-    return tuple(pair.scene for pair in usable if (task, pair.scene) not in held_out(task.suite))
+    scenes = [pair.scene for pair in usable(task.suite) if pair.task == task]
+    return tuple(scene for scene in scenes if (task, scene) not in held_out(task.suite))
 
 
 @cache

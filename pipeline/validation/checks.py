@@ -157,8 +157,7 @@ def instruction(case: Case) -> Iterator[Fault]:
 
 def _language(case: Case, copy: Copy) -> Iterator[Fault]:
     """Check the entries of the language columns, at the first step of each column that has others."""
-    persistent = persistent_annotations(case.made, train=copy.train)
-    expected = [(note.role, note.style, note.text, note.time_s, note.camera) for note in persistent]
+    expected = _language_entries(case, copy.train)
     for step, stored in enumerate(copy.said or ()):
         entries = [(*_spoken(row), np.float32(row["timestamp"]), row["camera"]) for row in stored]
         if entries != expected:
@@ -174,6 +173,21 @@ def _language(case: Case, copy: Copy) -> Iterator[Fault]:
         if shown != here:
             yield _other_entries(case, copy, f"language events of step {step}", shown, here)
             break
+
+
+def _language_entries(case: Case, train: bool) -> list[tuple[str, str, str, np.float32, None]]:
+    """List the persistent entries: the manifest's wordings (in the training split only), subtasks and motions."""
+    rewrites = case.made.rewrites if train else ()
+    entries: list[tuple[str, str, str, np.float32, None]] = []
+    if rewrites:
+        texts = dict.fromkeys([case.row["instruction"], *rewrites])
+        entries += [("user", "task_aug", text, np.float32(0), None) for text in texts]
+    for subtask in case.made.subtasks:
+        entries.append(("assistant", "subtask", subtask.text, np.float32(subtask.step / SCHEMA.fps_hz), None))
+    for note in persistent_annotations(case.made, train=False):
+        if note.style == "motion":
+            entries.append((note.role, note.style, note.text, note.time_s, None))
+    return entries
 
 
 def _spoken(row: Mapping[str, Any]) -> tuple[str, str, str]:

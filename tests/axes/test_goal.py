@@ -9,7 +9,7 @@ import pytest
 from conftest import starter_demo
 
 from pipeline.axes import Axes, from_json, task_of
-from pipeline.axes.goal import GoalAxis, GoalPerturbation, Pair, held_out, level, pairs
+from pipeline.axes.goal import GoalAxis, GoalPerturbation, held_out, level, pairs, usable
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation
 from pipeline.axes.language_goal import changed_goal
 from pipeline.axes.pose import PoseAxis, ScenePerturbation
@@ -17,6 +17,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import bddl
 from pipeline.libero.carried import CannotCarryError, bddl_text, carried, definition_of
 from pipeline.libero.tasks import SUITES, find_task, tasks
+from pipeline.physics.environment import Environment
 from pipeline.planning import plan
 from pipeline.run.replay_job import ReplayJob
 from pipeline.seeding import rng
@@ -56,10 +57,6 @@ ALSO = {
     },
 }
 """Task of a scene to the tasks of other scenes that it allows, read in LIBERO's files by hand."""
-
-
-def usable(suite: str) -> list[Pair]:
-    return [pair for pair in pairs(suite) if not pair.left_out]
 
 
 def test_the_other_bowl_of_a_spatial_scene_is_the_bowl_of_one_task() -> None:
@@ -158,6 +155,18 @@ def test_starts_are_shared_by_all_tasks_of_a_scene() -> None:
     assert one.reset_seed == other.reset_seed
     seeds = {GoalPerturbation(scene=scene, start=start, level=1).reset_seed for scene in "ab" for start in range(50)}
     assert len(seeds) == 100
+
+
+@pytest.mark.slow
+def test_tasks_that_share_a_start_begin_in_the_same_state() -> None:
+    scene = find_task("libero_object", f"{PICK}alphabet_soup{BASKET}")
+    seed = GoalPerturbation(scene=scene.name, start=0, level=1).reset_seed
+    starts = []
+    for grocery in ("milk", "butter"):
+        environment = Environment(carried(find_task("libero_object", f"{PICK}{grocery}{BASKET}"), scene))
+        starts.append((environment.reset(seed), environment.state.tolist()))
+        environment.close()
+    assert starts[0] == starts[1]
 
 
 def test_draws_are_keyed_and_within_the_configured_levels() -> None:
