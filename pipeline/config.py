@@ -95,12 +95,17 @@ class PlanConfig(Frozen):
             in any order, such as ``camera+light+language``, perturb the same episode.
         reserve: Share of additional candidates of each task, 0 to 10, rounded up; 0.5 by default. A failed episode is
             replaced by the reserve with the nearest level, then the same component.
+        task_weights: Weight of ``<suite>/<task>`` in the distribution of episodes over the tasks; 1 by default.
     """
 
     seed: int = Field(default=0, ge=-(2**63), lt=2**63)
     axes: Axes = Axes()
     episodes: dict[str, Count]
     reserve: float = Field(default=0.5, ge=0.0, le=10.0)
+    # Excluded at its default, as a field that was added later.
+    task_weights: dict[str, Annotated[float, Field(gt=0.0, le=1000.0)]] = Field(
+        default_factory=dict, exclude_if=lambda weights: not weights
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -319,6 +324,8 @@ class Config(Frozen):
     @model_validator(mode="after")
     def _sections_agree(self) -> Config:
         chosen, axes = select_tasks(self.demos.tasks), self.plan.axes
+        for task in self.plan.task_weights.keys() - set(map(str, chosen)):
+            raise ValueError(f"plan.task_weights: demos.tasks does not select {task!r}; expected <suite>/<task>")
         if axes.disturbance and self.replay.noops != "drop":
             raise ValueError("the axis disturbance requires replay.noops: drop, as pushes count steps without no-ops")
         if axes.disturbance and self.replay.mode == "open_loop":
@@ -391,9 +398,17 @@ def load(path: Path) -> Config:
     Raises:
         PipelineError: naming the file, every wrong field, and valid values.
     """
-    origins.check_module("libero")  # It has the list of tasks.
+    return validate(read_content(path), path)
+
+
+def read_content(path: Path) -> Any:
+    """Read the content of a configuration, without validation.
+
+    Raises:
+        PipelineError: naming the file.
+    """
     try:
-        return Config.model_validate(yaml.load(path.read_text(encoding="utf-8"), StrictLoader))
+        return yaml.load(path.read_text(encoding="utf-8"), StrictLoader)
     except (OSError, UnicodeDecodeError) as error:
         files = sorted(map(str, Path("configs").glob("*")))
         raise PipelineError(
@@ -403,6 +418,17 @@ def load(path: Path) -> Config:
         raise PipelineError(
             f"the file is not valid YAML: {error}", where=path, expected="a file such as configs/starter.yaml"
         ) from error
+
+
+def validate(content: Any, path: Path) -> Config:
+    """Validate the content of a configuration in the file ``path``.
+
+    Raises:
+        PipelineError: naming the file, every wrong field, and valid values.
+    """
+    origins.check_module("libero")  # It has the list of tasks.
+    try:
+        return Config.model_validate(content)
     except ValidationError as error:
         faults = "\n    ".join(describe(error, Config))
         raise PipelineError(

@@ -62,6 +62,7 @@ top = LazyGroup(
         "Policies": {
             "evaluate": Listed("evaluate", "Run a policy on LIBERO's, LIBERO-Plus's or held-out tasks."),
             "analyze": Listed("analyze", "Report on results, and compare runs with the test tasks."),
+            "focus": Listed("focus", "Write a configuration with more episodes for frequent failures of policies."),
         },
         "For contributors": {
             "schema": Listed("develop", "Write the files of schemas/ that follow from the code."),

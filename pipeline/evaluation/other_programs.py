@@ -139,16 +139,7 @@ def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
     Raises:
         PipelineError: if a path has no results on test tasks, if a file is damaged, or if two policies have one name.
     """
-    folders: list[Path] = []
-    policies: list[TestedPolicy] = []
-    for path in paths:
-        vla_eval, lerobot = _files(path)
-        if vla_eval:
-            policies.append(_policy(vla_eval[0].parent, "vla-eval", _vla_eval_files(vla_eval)))
-        elif lerobot is not None:
-            policies.append(_policy(lerobot.parent, "lerobot-eval", _lerobot_episodes(lerobot)))
-        else:
-            folders.append(path)
+    folders, policies = separate(paths)
     if folders:
         evaluated = [policy for policy in map(tested_policy, read(folders, PROTOCOL)) if policy is not None]
         if not evaluated:
@@ -167,6 +158,28 @@ def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
             remedy="rename one of the folders, or leave one out",
         )
     return policies
+
+
+def separate(paths: Sequence[Path]) -> tuple[list[Path], list[TestedPolicy]]:
+    """Separate folders of ``evaluate`` from results of vla-eval and lerobot-eval, which are read.
+
+    Returns:
+        The folders, and the outcomes of the policies of other programs.
+
+    Raises:
+        PipelineError: if a file is damaged, or has no results on test tasks.
+    """
+    folders: list[Path] = []
+    policies: list[TestedPolicy] = []
+    for path in paths:
+        vla_eval, lerobot = _files(path)
+        if vla_eval:
+            policies.append(_policy(vla_eval[0].parent, "vla-eval", _vla_eval_files(vla_eval)))
+        elif lerobot is not None:
+            policies.append(_policy(lerobot.parent, "lerobot-eval", _lerobot_episodes(lerobot)))
+        else:
+            folders.append(path)
+    return folders, policies
 
 
 def _files(path: Path) -> tuple[list[Path], Path | None]:

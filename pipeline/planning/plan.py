@@ -107,16 +107,35 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
                 axis.refuse_tested(test, tasks[0])
         # Each axis has its own order. Else small numbers of episodes would use the same tasks on all axes.
         order = sorted(groups, key=lambda group: digest(plan.seed, name, group[0].task.suite, group[0].task.name))
-        more = order[: episodes % len(groups)]
+        ordered = [group[0].task for group in order]
+        weights = [plan.task_weights.get(str(task), 1.0) for task in ordered]
+        wanted_of = dict(zip(ordered, apportion(episodes, weights), strict=True))
         for group in groups:
-            # Episodes are spread evenly; some tasks get one more if the number is not divisible.
-            wanted = episodes // len(groups) + (group in more)
+            wanted = wanted_of[group[0].task]
             dealt = sorted(group, key=lambda demo: digest(plan.seed, name, demo.demo_id))
             candidates = islice(_candidates(draws, dealt), wanted + ceil(wanted * plan.reserve))
             for rank, (demo, perturbations, variant) in enumerate(candidates):
                 candidate = row(demo, perturbations, plan.seed, replay)
                 rows.append(replace(candidate, rank=rank, variant=variant, wanted=rank < wanted))
     return rows
+
+
+def apportion(total: int, weights: Sequence[float], least: int = 0) -> list[int]:
+    """Divide a number in proportion to weights, by largest remainders; of equal remainders, the first are larger.
+
+    Args:
+        total: the number to divide, at least ``least`` for each weight.
+        weights: weights, not all 0.
+        least: smallest part.
+    """
+    exact = [total * weight / sum(weights) for weight in weights]
+    parts = [max(least, int(part)) for part in exact]
+    places = range(len(parts))
+    while sum(parts) < total:
+        parts[max(places, key=lambda place: exact[place] - parts[place])] += 1
+    while sum(parts) > total:
+        parts[max(places, key=lambda place: (parts[place] > least, parts[place] - exact[place]))] -= 1
+    return parts
 
 
 def _all_apply(axes: Sequence[Axis], task: Task) -> bool:
