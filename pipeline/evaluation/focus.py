@@ -98,7 +98,7 @@ class Focused:
 
     Attributes:
         episodes: entry of ``plan.episodes`` to its number.
-        levels: axis to its ``levels``; axes without results, and those that take entries of lists, are left out.
+        levels: axis to its ``levels``; axes without results, and axes that take entries of lists, are left out.
         task_weights: task to its weight.
     """
 
