@@ -33,6 +33,10 @@ CHECKOUT = (
 """Folders of a checkout that no run may use: tracked folders, git's folder, the packages and the user's tasks."""
 
 
+NAME = r"^[a-z][a-z0-9_]*$"
+"""Pattern of the name of a run."""
+
+
 class DemosConfig(Frozen):
     """Demonstrations that a run perturbs.
 
@@ -91,8 +95,9 @@ class PlanConfig(Frozen):
     Attributes:
         seed: Key of every random value of the run.
         axes: Ranges of each axis; default ranges for an axis of ``episodes`` that is not listed.
-        episodes: Number of kept episodes to generate of each axis, spread evenly over the tasks. Axes joined by ``+``
-            in any order, such as ``camera+light+language``, perturb the same episode.
+        episodes: Number of kept episodes to generate of each axis, spread over the tasks evenly or by
+            ``task_weights``. Axes joined by ``+`` in any order, such as ``camera+light+language``, perturb the same
+            episode.
         reserve: Share of additional candidates of each task, 0 to 10, rounded up; 0.5 by default. A failed episode is
             replaced by the reserve with the nearest level, then the same component.
         task_weights: Weight of ``<suite>/<task>`` in the distribution of episodes over the tasks; 1 by default.
@@ -279,7 +284,7 @@ class Config(Frozen):
         publish: Statements of the dataset card; none by default.
     """
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=LONGEST_NAME)
+    name: str = Field(pattern=NAME, max_length=LONGEST_NAME)
     # The default is left out, so that runs that were finished before the field existed stay up to date.
     folder: Place = Field(default=Path("data"), exclude_if=lambda folder: folder == Path("data"))
     demos: DemosConfig = DemosConfig()
@@ -324,8 +329,9 @@ class Config(Frozen):
     @model_validator(mode="after")
     def _sections_agree(self) -> Config:
         chosen, axes = select_tasks(self.demos.tasks), self.plan.axes
-        for task in self.plan.task_weights.keys() - set(map(str, chosen)):
-            raise ValueError(f"plan.task_weights: demos.tasks does not select {task!r}; expected <suite>/<task>")
+        for task in self.plan.task_weights:
+            if task not in map(str, chosen):
+                raise ValueError(f"plan.task_weights: demos.tasks does not select {task!r}; expected <suite>/<task>")
         if axes.disturbance and self.replay.noops != "drop":
             raise ValueError("the axis disturbance requires replay.noops: drop, as pushes count steps without no-ops")
         if axes.disturbance and self.replay.mode == "open_loop":

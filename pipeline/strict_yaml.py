@@ -49,5 +49,24 @@ for _tag, _pattern, _first in (
     StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"({_pattern})$"), list(_first))
 
 
+class _StrictDumper(yaml.SafeDumper):
+    """Dumper whose plain text ``StrictLoader`` reads as text."""
+
+
+def _text(dumper: _StrictDumper, text: str) -> yaml.Node:
+    """Represent a text, in quotes if ``StrictLoader`` reads it as another value."""
+    resolver: Any = StrictLoader("")
+    plain = resolver.resolve(yaml.ScalarNode, text, (True, False)) == "tag:yaml.org,2002:str"
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else "'")
+
+
+_StrictDumper.add_representer(str, _text)
+
+
+def dump(content: Any) -> str:
+    """Return the YAML of plain values, which ``StrictLoader`` reads as the same values; short lists are on one line."""
+    return str(yaml.dump(content, Dumper=_StrictDumper, sort_keys=False, default_flow_style=None, width=120))
+
+
 class FastStrictLoader(_EachKeyOnce, yaml.CSafeLoader):
     """Loader in C for long files, which rejects repeated keys too. Thousands of nested levels end the process."""

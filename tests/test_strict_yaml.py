@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from pipeline.config import Config
-from pipeline.strict_yaml import FastStrictLoader, StrictLoader
+from pipeline.strict_yaml import FastStrictLoader, StrictLoader, dump
 
 LOADERS = (StrictLoader, FastStrictLoader)
 
@@ -32,6 +32,31 @@ def test_merge_keys_at_any_depth_are_read_as_yaml_says(loader: Any) -> None:
 def test_a_key_given_twice_is_refused_wherever_it_is(loader: Any, text: str) -> None:
     with pytest.raises(yaml.YAMLError, match="the key 'x' is repeated"):
         yaml.load(text, loader)
+
+
+def test_written_values_are_read_again() -> None:
+    texts = [
+        "1e5",
+        "1.5e3",
+        ".5e3",
+        "-.5",
+        "1e-05",
+        "12e4567",
+        "yes",
+        "1:30",
+        "0123",
+        "null",
+        "",
+        "a: b",
+        "# c",
+        "true",
+    ]
+    content = {
+        "texts": texts,
+        "numbers": [1, 1e-05, 0.5, -3, True, None],
+        "nested": {"folder": "1e5", "list": [{}, []]},
+    }
+    assert yaml.load(dump(content), StrictLoader) == content
 
 
 SCALARS = (

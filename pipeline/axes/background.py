@@ -174,6 +174,10 @@ class BackgroundAxis(Axis):
     image_share: Share = 0.3
     colour_scale: ByLevel[Share] = (0.2, 0.4, 0.6, 0.8, 1.0)
 
+    def levels_set_shares(self, task: Task) -> bool:
+        """Return whether no perturbation has level 5 for its textures' own colours."""
+        return self.own_colours == 0 or 5 not in self.levels
+
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
         component = pick(rng, self.components)
         level = self.draw_level(rng)

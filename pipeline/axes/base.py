@@ -227,6 +227,10 @@ class Axis(Frozen):
         """List the entries that the axis takes its perturbations of a task from; empty if it samples from ranges."""
         return ()
 
+    def levels_set_shares(self, task: Task) -> bool:
+        """Return whether each level of a task's perturbations is as frequent as in ``levels``."""
+        return True
+
     @property
     def keeps_clearance(self) -> bool:
         """Return whether perturbations keep their clearance to the test tasks."""

@@ -161,6 +161,10 @@ class GoalAxis(Axis):
     def applies(self, task: Task) -> bool:
         return bool(self.entries(task))
 
+    def levels_set_shares(self, task: Task) -> bool:
+        """Return ``False``: the levels only select scenes."""
+        return False
+
     def entries(self, task: Task) -> Sequence[str]:
         """List the names of the scenes to which the task is carried, of the configured levels."""
         return [scene.name for scene in _trained(task) if level(task, scene) in self.levels]

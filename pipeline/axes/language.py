@@ -120,6 +120,10 @@ class LanguageAxis(Axis):
         """Return the level by the edit distance to the LIBERO task's instruction, as for rewrites."""
         return level_of(str(tested.parameters["text"]), find_task(tested.suite, tested.base).instruction)
 
+    def levels_set_shares(self, task: Task) -> bool:
+        """Return ``False``: the levels only select rewrites."""
+        return False
+
     def entries(self, task: Task) -> tuple[str, ...]:
         """List the task's rewrites in the order of ``deal``.
 

@@ -418,6 +418,10 @@ class PoseAxis(Axis):
         """
         return 5 if tested.suite == "libero_goal" else int(tested.parameters["level"])
 
+    def levels_set_shares(self, task: Task) -> bool:
+        """Return whether no scene has level 5 for LIBERO-Plus's places."""
+        return self.benchmark_places == 0 or 5 not in self.levels or not _benchmark_places_m(task)
+
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
         component, moved = pick(rng, self._choices(task))
         level = self.draw_level(rng)

@@ -1,6 +1,7 @@
 """Command ``focus``, which prints one line of JSON last."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -29,7 +30,7 @@ from pipeline.commands.base import PATH, Command, example
     metavar="FILE",
     required=True,
     type=PATH,
-    help="Configuration to write; its name, without .yaml, becomes the name of the run.",
+    help="New configuration; its name, without .yaml, becomes the name of the run.",
 )
 @click.option(
     "--episodes",
@@ -40,14 +41,14 @@ from pipeline.commands.base import PATH, Command, example
 @click.option(
     "--floor",
     metavar="X",
-    type=float,
+    type=click.FloatRange(0, 1),
     default=0.5,
     help="Smallest share, as a multiple of the share in CONFIG (default: 0.5).",
 )
 @click.option(
     "--cap",
     metavar="X",
-    type=float,
+    type=click.FloatRange(1, 100),
     default=2.0,
     help="Largest share, as a multiple of the share in CONFIG (default: 2).",
 )
@@ -56,12 +57,14 @@ def focus(results: tuple[Path, ...], source: Path, out: Path, episodes: int | No
 
     A new share is the share in CONFIG times the rate of failures, from floor to cap. The rate of an axis, level or task
     with few results is close to the mean rate. The command prints the reason of each share, and writes it into the
-    file. The last line of the output is JSON.
+    file, without the comments of CONFIG. Results of vla-eval and lerobot-eval count for LIBERO-Plus's test tasks only.
+    The last line of the output is JSON.
     """
     from pipeline.evaluation import focus as focusing
 
     limits = focusing.Limits(floor, cap)
     focused = focusing.write(results, source, out, episodes, limits)
     print("\n".join("  ".join(row).rstrip() for row in focusing.table(focused.reasons)))
-    changed = {"file": str(out), "episodes": focused.episodes, "levels": focused.levels}
-    print(json.dumps({**changed, "task_weights": focused.task_weights}))
+    counted = ", ".join(f"{policy} ({number})" for policy, number in focused.policies.items())
+    print(f"counted episodes: {counted}; left out, of other tasks, axes or levels: {focused.left_out}")
+    print(json.dumps({"file": str(out), **asdict(focused), "reasons": [row._asdict() for row in focused.reasons]}))

@@ -1,11 +1,13 @@
-"""Focus of a plan on failures: episodes by failure rates of evaluated policies on axes, levels and tasks.
+"""Focus of a plan on failures: a configuration whose episodes follow the failures of policies on axes, levels, tasks.
 
-A rate is that of ``smoothed``, so that few episodes say little. Axes, levels and tasks without results have the mean
-rate of the group that they belong to. A new share is the configured share times the rate, within a floor and a cap.
+With few episodes, a smoothed rate of failures stays close to the mean rate. A new share is the share before times the
+rate of failures, from a floor to a cap.
 """
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -15,58 +17,69 @@ from statistics import fmean
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import yaml
 from scipy.optimize import brentq
 
-from pipeline.axes import axes_of, level_of_test
-from pipeline.config import Config, read_content, validate
+from pipeline.axes import Axis, axes_of, level_of_test
+from pipeline.config import NAME, Config, read_content, validate
 from pipeline.errors import PipelineError
-from pipeline.evaluation.other_programs import PROTOCOL, separate
-from pipeline.evaluation.results import read
+from pipeline.evaluation.other_programs import separate
+from pipeline.evaluation.results import EpisodeResult, read
 from pipeline.evaluation.statistics import wilson
-from pipeline.files import refuse_other_file
+from pipeline.evaluation.tasks import carried_task
 from pipeline.files import write as write_file
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import select_tasks
 from pipeline.planning.plan import apportion
+from pipeline.strict_yaml import dump
 from pipeline.testset import benchmark
+from pipeline.types import Floats
 
 PRIOR = 5
-"""Number of imagined episodes with the mean rate that are added to each group's episodes."""
+"""Number of imagined episodes with the mean rate that are added to the episodes of a group."""
 
 LEVEL_ENTRIES = 20
 """Number of entries of ``levels`` that state the shares of the levels."""
 
+LEAST_WEIGHT = 0.01
 
-Kind = Literal["episodes", "level", "task"]
+Kind = Literal["axis", "episodes", "level", "task"]
 
 
 class Attempt(NamedTuple):
     """One episode of an evaluated policy.
 
     Attributes:
+        policy: name of the policy.
         axes: perturbed axes; empty for LIBERO's own tasks.
-        level: strength, 1 to 5; 0 if it is unknown, or that of several axes.
-        task: suite/name of the LIBERO task.
+        level: strength, 1 to 5; 0 if it is unknown, and for several axes.
+        task: suite/name of the LIBERO task that the policy was asked for.
         failed: True if the goal was not reached.
     """
 
+    policy: str
     axes: tuple[str, ...]
     level: int
     task: str
     failed: bool
+
+    @property
+    def entry(self) -> str:
+        """Return the perturbed axes as an entry of ``plan.episodes``; empty for LIBERO's own tasks."""
+        return "+".join(axes_of("+".join(self.axes))) if self.axes else ""
 
 
 class Reason(NamedTuple):
     """Reason of one new share.
 
     Attributes:
-        kind: ``episodes`` for an entry of ``plan.episodes``, ``level`` for a level of an axis, ``task`` for a task.
-        name: name of the entry; axis and level; or name of the task.
-        failures, episodes: results on it.
-        rate: smoothed rate of failures.
-        before, after: share before and after, as the configuration states it.
-        note: ``floor`` or ``cap`` if it limits the share, ``no results`` if there are none.
+        kind: ``axis`` for a rate without a share of its own, ``episodes`` for an entry of ``plan.episodes``, ``level``
+            for a level of an axis, ``task`` for a task.
+        name: name of the axis or entry; axis and level; or name of the task.
+        failures, episodes: results of its episodes.
+        rate: smoothed rate of failures; of a task, smoothed failures divided by the expected ones.
+        before, after: shares, 0 to 1; `None` for an axis.
+        written: number, entries of ``levels`` or weight in the new configuration; `None` for an axis.
+        note: ``floor``, ``cap`` or ``at least 1`` if it limits the share, ``no results`` if there are none.
     """
 
     kind: Kind
@@ -74,19 +87,20 @@ class Reason(NamedTuple):
     failures: int
     episodes: int
     rate: float
-    before: float
-    after: float
-    note: str
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """Return Wilson's 95 % interval of the measured rate of failures; `None` without results."""
-        return wilson(self.failures, self.episodes) if self.episodes else None
+    before: float | None = None
+    after: float | None = None
+    written: float | None = None
+    note: str = ""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a new share, as multiples of the share without any focus."""
+    """Limits of a new share, as multiples of the share before.
+
+    Attributes:
+        floor: smallest multiple, 0 to 1.
+        cap: largest multiple, at least 1.
+    """
 
     floor: float = 0.5
     cap: float = 2.0
@@ -98,239 +112,315 @@ class Focused:
 
     Attributes:
         episodes: entry of ``plan.episodes`` to its number.
-        levels: axis to its ``levels``; axes without results, and axes that take entries of lists, are left out.
-        task_weights: task to its weight.
+        levels: axis to its ``levels``, of axes whose shares of levels follow from them.
+        task_weights: task to its weight; the mean is about 1.
+        policies: policy to the number of its episodes that count.
+        left_out: number of episodes that do not count, because they are about other tasks, axes or levels.
     """
 
     episodes: dict[str, int]
     levels: dict[str, list[int]]
     task_weights: dict[str, float]
     reasons: list[Reason]
+    policies: dict[str, int]
+    left_out: int
 
 
 def attempts(paths: Sequence[Path]) -> list[Attempt]:
     """Read the episodes of all policies from results of ``evaluate``, vla-eval and lerobot-eval.
 
     Raises:
-        PipelineError: if a path has no results, or a file is damaged.
+        PipelineError: if a path has no results, if a file is damaged, or if policies had black views or no instruction.
     """
     folders, policies = separate(paths)
-    found: list[Attempt] = []
-    for evaluated in read(folders, PROTOCOL) if folders else ():
-        for row in evaluated.rows:
-            axes = () if row.axis == "clean" else tuple(row.axis.split("+"))
-            level = row.level if len(axes) == 1 else 0
-            found.append(Attempt(axes, level, f"{row.suite}/{row.base}", not row.success))
+    listed: list[Attempt] = []
+    for evaluated in read(folders, ("prompt", "step_limit")) if folders else ():
+        settings = evaluated.settings
+        if settings.get("black", "none") != "none" or settings.get("prompt") == "blank":
+            raise PipelineError(
+                f"{evaluated.name} had black views or no instruction, so its failures do not show lacking episodes",
+                where=", ".join(map(str, folders)),
+                expected="results of policies with their views and instructions",
+                remedy="leave out the folder",
+            )
+        listed += filter(None, (_attempt(evaluated.name, row) for row in evaluated.rows))
     for policy in policies:
         for outcome in policy.outcomes:
             test = benchmark.load().find(outcome.suite, outcome.name)
             task = f"{test.suite}/{test.base}"
-            found.append(Attempt((test.axis,), level_of_test(test), task, not outcome.success))
-    return found
+            listed.append(Attempt(policy.name, (test.axis,), level_of_test(test), task, not outcome.success))
+    return listed
 
 
-def focus(config: Config, tried: Sequence[Attempt], episodes: int | None = None, limits: Limits = Limits()) -> Focused:
+def _attempt(policy: str, row: EpisodeResult) -> Attempt | None:
+    """Return the attempt of a result; ``None`` for the source ``goals`` if no plan can train its goal."""
+    task = f"{row.suite}/{row.base}"
+    if row.source == "goals":
+        carried = carried_task(row)
+        if carried is None:
+            return None
+        task = str(carried)
+    axes = () if row.axis == "clean" else tuple(row.axis.split("+"))
+    return Attempt(policy, axes, row.level if len(axes) == 1 else 0, task, not row.success)
+
+
+def focus(config: Config, results: Sequence[Attempt], episodes: int | None, limits: Limits = Limits()) -> Focused:
     """Distribute a plan's episodes by failure rates.
 
     Args:
         config: the configuration whose plan is changed.
-        tried: episodes of evaluated policies.
-        episodes: total number of kept perturbed episodes; that of the configuration by default.
+        results: episodes of evaluated policies. Episodes on other tasks, axes or levels than the plan's do not count.
+        episodes: total number of kept perturbed episodes; ``None`` for that of the configuration.
         limits: floor and cap.
 
     Raises:
-        PipelineError: if no result belongs to an axis of the plan, or if the floor and the cap exclude each other.
+        PipelineError: if no result belongs to an axis of the plan, or if ``episodes`` is too small.
     """
-    if not 0 <= limits.floor <= 1 <= limits.cap:
+    plan = config.plan
+    total = sum(plan.episodes.values()) if episodes is None else episodes
+    if total < len(plan.episodes):
         raise PipelineError(
-            f"floor {limits.floor:g}, cap {limits.cap:g}", expected="a floor from 0 to 1, and a cap of at least 1"
-        )
-    total = episodes if episodes is not None else sum(config.plan.episodes.values())
-    if total < len(config.plan.episodes):
-        raise PipelineError(
-            f"{total} episodes for {len(config.plan.episodes)} entries of plan.episodes",
+            f"{total} episodes for {len(plan.episodes)} entries of plan.episodes",
             where="--episodes",
-            expected="at least one for each",
+            expected="at least one for each entry",
         )
-    axes = config.plan.axes.configured()
-    by_axis = grouped((axis, one) for one in tried for axis in one.axes if axis in axes)
-    if not by_axis:
-        tested = ", ".join(sorted({axis for one in tried for axis in one.axes})) or "no axis"
+    axes, tasks = plan.axes.configured(), select_tasks(config.demos.tasks)
+    weights = {str(task): plan.task_weights.get(str(task), 1.0) for task in tasks}
+    of_plan = [attempt for attempt in results if attempt.task in weights and _is_of_axes(attempt, axes)]
+    by_axes = grouped((attempt.entry, attempt) for attempt in of_plan)
+    if not by_axes.keys() - {""}:
+        about = ", ".join(sorted({axis for attempt in results for axis in attempt.axes})) or "no axis"
         raise PipelineError(
-            f"the results are about {tested}",
-            where="RESULTS",
-            expected=f"results on axes of the plan: {', '.join(axes)}",
+            f"no result is about an axis and a task of the plan, but about {about}",
+            where="PATH",
+            expected=f"results on {', '.join(axes)}, on tasks that demos.tasks selects",
             remedy="evaluate the policy on --source libero_plus, own or goals",
         )
-    mean = _mean([one for one in tried if {*one.axes} & by_axis.keys()])
-    of_axis = {axis: smoothed(by_axis.get(axis, ()), mean) for axis in axes}
-    numbers, reasons = _by_entry(config.plan.episodes, by_axis, of_axis, total, limits)
+    rates = _rates(by_axes, [*axes, *plan.episodes])
+    reasons = [_reason("axis", axis, by_axes.get(axis, ()), rates[axis]) for axis in axes]
+    numbers, of_entries = _by_entry(plan.episodes, by_axes, rates, total, limits)
     levels: dict[str, list[int]] = {}
-    tasks = select_tasks(config.demos.tasks)
-    for axis in axes:
-        known = [one for one in by_axis.get(axis, ()) if one.level in axes[axis].levels]
-        # The levels of an axis with lists only select entries, so their shares cannot be stated.
-        if known and not any(axes[axis].entries(task) for task in tasks):
-            levels[axis], further = _by_level(axis, axes[axis].levels, known, of_axis[axis], limits)
-            reasons += further
-    before = {str(task): config.plan.task_weights.get(str(task), 1.0) for task in tasks}
-    weights, further = _by_task(before, tried, limits)
-    return Focused(numbers, levels, weights, [*reasons, *further])
+    of_levels: list[Reason] = []
+    for axis, settings in axes.items():
+        with_level = [attempt for attempt in by_axes.get(axis, ()) if attempt.level]
+        if with_level and all(settings.levels_set_shares(task) for task in tasks):
+            levels[axis], of_axis = _by_level(axis, settings.levels, with_level, rates[axis], limits)
+            of_levels += of_axis
+    new_weights, of_tasks = _by_task(weights, by_axes, limits)
+    return Focused(
+        numbers,
+        levels,
+        new_weights,
+        [*reasons, *of_entries, *of_levels, *of_tasks],
+        dict(Counter(attempt.policy for attempt in of_plan)),
+        len(results) - len(of_plan),
+    )
+
+
+def _is_of_axes(attempt: Attempt, axes: Mapping[str, Axis]) -> bool:
+    """Return whether the axes of an attempt, and its level if it is known, are among those of a plan."""
+    if not axes.keys() >= {*attempt.axes}:
+        return False
+    return attempt.level == 0 or any(attempt.level in axes[axis].levels for axis in attempt.axes)
+
+
+def smoothed(results: Sequence[Attempt], mean: float) -> float:
+    """Return the rate of failures with ``PRIOR`` further episodes at the mean rate."""
+    return (_failures(results) + PRIOR * mean) / (len(results) + PRIOR)
+
+
+def _failures(results: Iterable[Attempt]) -> int:
+    return sum(attempt.failed for attempt in results)
+
+
+def _rates(by_axes: Mapping[str, Sequence[Attempt]], names: Iterable[str]) -> dict[str, float]:
+    """Return the rate of each axis and combination.
+
+    The mean rate counts a success and a failure more, so that it is neither 0 nor 1. A combination is smoothed towards
+    the mean rate of its axes.
+    """
+    perturbed = list(chain.from_iterable(results for name, results in by_axes.items() if name))
+    mean = (_failures(perturbed) + 1) / (len(perturbed) + 2)
+    rates: dict[str, float] = {}
+    for name in sorted({*names, *by_axes} - {""}, key=lambda name: name.count("+")):
+        parts = axes_of(name)
+        expected = mean if len(parts) == 1 else fmean(rates[axis] for axis in parts)
+        rates[name] = smoothed(by_axes.get(name, ()), expected)
+    return rates
 
 
 def _by_entry(
     before: Mapping[str, int],
-    by_axis: Mapping[str, Sequence[Attempt]],
+    by_axes: Mapping[str, Sequence[Attempt]],
     rates: Mapping[str, float],
     total: int,
     limits: Limits,
 ) -> tuple[dict[str, int], list[Reason]]:
-    """Distribute ``total`` episodes over the entries of ``plan.episodes`` by the mean rate of each entry's axes."""
-    tried: dict[str, list[Attempt]] = {}
-    for name in before:
-        tried[name] = list(chain.from_iterable(by_axis.get(axis, ()) for axis in axes_of(name)))
-    of_entry = {name: fmean(rates[axis] for axis in axes_of(name)) for name in before}
-    shares = _shares(before, of_entry, limits)
+    """Distribute ``total`` episodes over the entries of ``plan.episodes``."""
+    shares = _shares(before, rates, limits)
     numbers = dict(zip(before, apportion(total, [*shares.values()], least=1), strict=True))
-    return numbers, _reasons("episodes", tried, of_entry, before, shares, numbers, limits)
+    return numbers, _reasons("episodes", by_axes, rates, before, shares, numbers, limits)
 
 
 def _by_level(
-    axis: str, before: Sequence[int], tried: Sequence[Attempt], of_axis: float, limits: Limits
+    axis: str, before: Sequence[int], results: Sequence[Attempt], of_axis: float, limits: Limits
 ) -> tuple[list[int], list[Reason]]:
     """Distribute the entries of an axis's ``levels`` by the rate of each level; each level keeps an entry."""
     names = {f"{axis} {level}": level for level in sorted({*before})}
-    old = {name: float(before.count(level)) for name, level in names.items()}
-    of_level = grouped((f"{axis} {one.level}", one) for one in tried)
-    rates = {name: smoothed(of_level.get(name, ()), of_axis) for name in names}
-    shares = _shares(old, rates, limits)
-    numbers = dict(zip(names, apportion(LEVEL_ENTRIES, [*shares.values()], least=1), strict=True))
+    entries_before = {name: before.count(level) for name, level in names.items()}
+    by_level = grouped((f"{axis} {attempt.level}", attempt) for attempt in results)
+    rates = {name: smoothed(by_level.get(name, ()), of_axis) for name in names}
+    shares = _shares(entries_before, rates, limits)
+    entries = apportion(max(LEVEL_ENTRIES, len(before)), [*shares.values()], least=1)
+    numbers = dict(zip(names, entries, strict=True))
     levels: list[int] = []
     for name, level in names.items():
         levels += [level] * numbers[name]
-    return levels, _reasons("level", of_level, rates, old, shares, numbers, limits)
+    return levels, _reasons("level", by_level, rates, entries_before, shares, numbers, limits)
 
 
 def _by_task(
-    before: Mapping[str, float], tried: Sequence[Attempt], limits: Limits
+    before: Mapping[str, float], by_axes: Mapping[str, Sequence[Attempt]], limits: Limits
 ) -> tuple[dict[str, float], list[Reason]]:
-    """Distribute weights with the mean 1 over tasks by the rate of each task, its unperturbed episodes included."""
-    of_task = grouped((one.task, one) for one in tried if one.task in before)
-    mean = _mean(list(chain.from_iterable(of_task.values())))
-    rates = {task: smoothed(of_task.get(task, ()), mean) for task in before}
-    shares = _shares(before, rates, limits)
-    weights = {task: round(len(before) * share, 2) for task, share in shares.items()}
-    return weights, _reasons("task", of_task, rates, before, shares, weights, limits)
+    """Distribute weights with the mean 1 over tasks, by their failures divided by the expected ones.
 
-
-def smoothed(tried: Iterable[Attempt], mean: float) -> float:
-    """Return the rate of failures with ``PRIOR`` further episodes at the mean rate."""
-    failed = [one.failed for one in tried]
-    return (sum(failed) + PRIOR * mean) / (len(failed) + PRIOR)
-
-
-def _mean(tried: Sequence[Attempt]) -> float:
-    """Return the rate of failures, of one success and one failure more, so that it is neither 0 nor 1."""
-    return (sum(one.failed for one in tried) + 1) / (len(tried) + 2)
+    The expected failures are those with the rates of the axes over all tasks. A task that was evaluated more on
+    difficult axes therefore gets no larger weight for it. Both numbers are smoothed by ``PRIOR`` failures.
+    """
+    by_task = grouped((attempt.task, attempt) for attempt in chain.from_iterable(by_axes.values()))
+    rates = {name: _failures(results) / len(results) for name, results in by_axes.items()}
+    ratios: dict[str, float] = {}
+    for task in before:
+        of_task = by_task.get(task, [])
+        expected = sum(rates[attempt.entry] for attempt in of_task)
+        ratios[task] = (_failures(of_task) + PRIOR) / (expected + PRIOR)
+    shares = _shares(before, ratios, limits)
+    weights = {task: max(LEAST_WEIGHT, round(len(before) * share, 2)) for task, share in shares.items()}
+    return weights, _reasons("task", by_task, ratios, before, shares, weights, limits)
 
 
 def _shares(before: Mapping[str, float], rates: Mapping[str, float], limits: Limits) -> dict[str, float]:
-    """Return shares with the sum 1: in proportion to number times rate, from floor to cap times the share before."""
-    old = np.array([*before.values()], float)
+    """Return shares with the sum 1: c times share before times rate, from floor to cap times the share before."""
+    old: Floats = np.array([*before.values()], float)
     old /= old.sum()
-    wanted = old * [rates[name] for name in before]
+    if limits.floor == 1 or limits.cap == 1:
+        return dict(zip(before, old.tolist(), strict=True))
+    weighted = old * [rates[name] for name in before]
 
-    def limited(factor: float) -> np.ndarray[Any, np.dtype[np.float64]]:
-        return np.clip(factor * wanted, limits.floor * old, limits.cap * old)
+    def shares_at(factor: float) -> Floats:
+        return np.asarray(np.clip(factor * weighted, limits.floor * old, limits.cap * old))
 
-    largest = limits.cap * float((old / wanted).max())
-    factor = brentq(lambda value: float(limited(value).sum()) - 1.0, 0.0, largest)
-    shares = limited(factor)
+    # At the largest factor each share is at its cap.
+    largest = limits.cap * float((old / weighted).max())
+    factor = brentq(lambda factor: float(shares_at(factor).sum()) - 1.0, 0.0, largest)
+    shares = shares_at(factor)
     return dict(zip(before, (shares / shares.sum()).tolist(), strict=True))
+
+
+def _reason(kind: Kind, name: str, results: Sequence[Attempt], rate: float, **fields: Any) -> Reason:
+    notes = [*([] if results else ["no results"]), *filter(None, [fields.pop("note", "")])]
+    return Reason(kind, name, _failures(results), len(results), rate, **fields, note=", ".join(notes))
 
 
 def _reasons(
     kind: Kind,
-    tried: Mapping[str, Sequence[Attempt]],
+    results: Mapping[str, Sequence[Attempt]],
     rates: Mapping[str, float],
     before: Mapping[str, float],
     shares: Mapping[str, float],
-    after: Mapping[str, float],
+    written: Mapping[str, float],
     limits: Limits,
 ) -> list[Reason]:
     """Return the reason of each share."""
     reasons: list[Reason] = []
     for name, share in shares.items():
-        of_name = tried.get(name, ())
-        factor = share * sum(before.values()) / before[name]
-        notes = [] if of_name else ["no results"]
-        if isclose(factor, limits.floor):
-            notes.append("floor")
-        elif isclose(factor, limits.cap):
-            notes.append("cap")
-        failures = sum(one.failed for one in of_name)
-        reasons.append(
-            Reason(kind, name, failures, len(of_name), rates[name], before[name], after[name], ", ".join(notes))
-        )
+        share_before = before[name] / sum(before.values())
+        note = "floor" if isclose(share, limits.floor * share_before) else ""
+        note = "cap" if isclose(share, limits.cap * share_before) else note
+        if kind != "task" and share * sum(written.values()) < 1:
+            note = "at least 1"
+        fields = {"before": share_before, "after": share, "written": written[name], "note": note}
+        reasons.append(_reason(kind, name, results.get(name, ()), rates[name], **fields))
     return reasons
 
 
 def write(
     results: Sequence[Path], source: Path, out: Path, episodes: int | None = None, limits: Limits = Limits()
 ) -> Focused:
-    """Write a configuration, and the reasons of its shares as a comment.
+    """Write a new configuration, with the reasons of its shares as a comment.
 
     Args:
         results: results of policies, as ``attempts``.
         source: configuration to start from.
-        out: file to write; its stem is the name of the run.
+        out: new file; its stem is the name of the run.
 
     Raises:
-        PipelineError: if the file exists and is not such a configuration, or as ``attempts`` and ``focus``.
+        PipelineError: if the file exists, or has no name for a run; also as ``attempts`` and ``focus``.
     """
-    refuse_other_file(out, MARK)
-    if out.resolve() == source.resolve():
-        raise PipelineError("--out is the configuration to start from", where=out, remedy="choose another name")
-    content = read_content(source)
-    focused = focus(validate(content, source), attempts(results), episodes, limits)
-    plan = content["plan"]
-    axes = dict(plan.get("axes") or {})
-    for axis, levels in focused.levels.items():
-        axes[axis] = {**(axes.get(axis) or {}), "levels": levels}
-    changed = {"axes": axes, "episodes": focused.episodes, "task_weights": focused.task_weights}
-    content |= {"name": out.stem, "plan": {**plan, **changed}}
-    head = [
-        MARK,
-        f"# {', '.join(map(str, results))}",
-        f"# From {source}: a share is the share there times the rate of failures, smoothed by {PRIOR} more episodes",
-        f"# with the mean rate, and at least {limits.floor:g} and at most {limits.cap:g} times the share there.",
-        "#",
-        *("# " + "  ".join(row).rstrip() for row in table(focused.reasons)),
-    ]
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-    validate(content, out)
-    write_file(out, "\n".join(head) + "\n\n" + text)
+    config, content = validate(read_content(source), source), read_content(source)
+    if out.exists():
+        raise PipelineError("the file exists, and may have been edited", where=out, remedy="choose another name")
+    if not re.fullmatch(NAME, out.stem) or out.stem == config.name:
+        raise PipelineError(
+            f"the run would have the name {out.stem!r}",
+            where=f"--out {out}",
+            expected=f"another name than {config.name}, of small letters, digits and underscores, as <name>.yaml",
+        )
+    focused = focus(config, attempts(results), episodes, limits)
+    changed = _changed(content, focused, out.stem)
+    validate(changed, out)
+    write_file(out, _comment(focused, results, source, limits) + "\n" + dump(changed))
     return focused
 
 
-MARK = "# Written by `python -m pipeline focus`: episodes by the failures in these results."
-"""First line of a written configuration."""
+def _changed(content: Mapping[str, Any], focused: Focused, name: str) -> dict[str, Any]:
+    """Return the content of a configuration with the new plan, and without names of the datasets of its old run."""
+    plan = dict(content["plan"])
+    axes = dict(plan.get("axes") or {})
+    for axis, levels in focused.levels.items():
+        axes[axis] = {**(axes.get(axis) or {}), "levels": levels}
+    plan |= {"axes": axes, "episodes": focused.episodes, "task_weights": focused.task_weights}
+    export: dict[str, Any] = {}
+    for key, options in (content.get("export") or {}).items():
+        unnamed = {field: value for field, value in options.items() if field != "name"} if options else options
+        export[key] = unnamed if isinstance(options, dict) else options
+    return {**content, "name": name, "plan": plan, **({"export": export} if "export" in content else {})}
 
-HEADINGS = ("for", "name", "failed", "rate (95 %)", "smoothed", "before", "after", "note")
+
+def _comment(focused: Focused, results: Sequence[Path], source: Path, limits: Limits) -> str:
+    """Return the head of a new configuration: results, formula and reasons."""
+    counted = ", ".join(f"{policy} ({number})" for policy, number in focused.policies.items())
+    lines = [
+        f"Written by `python -m pipeline focus` from {str(source)!a}, by failures of policies in",
+        *(f"  {str(path)!a}" for path in results),
+        f"Counted episodes: {counted!a}; left out, of other tasks, axes or levels: {focused.left_out}.",
+        "",
+        f"after = c * before * smoothed rate, from {limits.floor:g} to {limits.cap:g} times before; c makes the sum 1.",
+        f"The smoothed rate counts {PRIOR} more episodes with the mean rate; those of tasks are relative to axes.",
+        "",
+        *("  ".join(row) for row in table(focused.reasons)),
+    ]
+    return "".join(f"# {line}".rstrip() + "\n" for line in lines)
+
+
+HEADINGS = ("for", "name", "failed", "rate (95 %)", "smoothed", "before", "after", "written", "note")
 
 
 def table(reasons: Sequence[Reason]) -> list[list[str]]:
     """Return the table of reasons, with headings and columns of equal width."""
     rows = [list(HEADINGS)]
     for reason in reasons:
-        interval = reason.interval
-        rate = f"{100 * reason.failures / reason.episodes:.0f} %" if reason.episodes else "-"
-        bounds = "" if interval is None else f" ({100 * interval[0]:.0f} to {100 * interval[1]:.0f})"
-        rows.append(
-            [
-                *(reason.kind, reason.name, f"{reason.failures} of {reason.episodes}", rate + bounds),
-                *(f"{100 * reason.rate:.0f} %", f"{reason.before:g}", f"{reason.after:g}", reason.note),
-            ]
-        )
+        low, high = wilson(reason.failures, reason.episodes)
+        interval = f"({_percent(low)} to {_percent(high)})"
+        rate = f"{_percent(reason.failures / reason.episodes)} {interval}" if reason.episodes else "-"
+        smooth = f"x {reason.rate:.2f}" if reason.kind == "task" else _percent(reason.rate)
+        shares = ["-" if share is None else _percent(share) for share in (reason.before, reason.after)]
+        written = "-" if reason.written is None else f"{reason.written:g}"
+        counts = f"{reason.failures} of {reason.episodes}"
+        rows.append([reason.kind, reason.name, counts, rate, smooth, *shares, written, reason.note])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"

@@ -149,14 +149,7 @@ def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
                 expected="results of `evaluate --source libero_plus`",
             )
         policies = [*evaluated, *policies]
-    repeated = [name for name, count in Counter(policy.name for policy in policies).items() if count > 1]
-    if repeated:
-        raise PipelineError(
-            f"two policies have the name {repeated[0]!r}",
-            where=", ".join(map(str, paths)),
-            expected="different names of the folders, which name the policies of vla-eval and lerobot-eval",
-            remedy="rename one of the folders, or leave one out",
-        )
+    _refuse_shared_names(policies, paths)
     return policies
 
 
@@ -167,7 +160,7 @@ def separate(paths: Sequence[Path]) -> tuple[list[Path], list[TestedPolicy]]:
         The folders, and the outcomes of the policies of other programs.
 
     Raises:
-        PipelineError: if a file is damaged, or has no results on test tasks.
+        PipelineError: if a file is damaged, if it has no results on test tasks, or if two policies have one name.
     """
     folders: list[Path] = []
     policies: list[TestedPolicy] = []
@@ -179,7 +172,19 @@ def separate(paths: Sequence[Path]) -> tuple[list[Path], list[TestedPolicy]]:
             policies.append(_policy(lerobot.parent, "lerobot-eval", _lerobot_episodes(lerobot)))
         else:
             folders.append(path)
+    _refuse_shared_names(policies, paths)
     return folders, policies
+
+
+def _refuse_shared_names(policies: Sequence[TestedPolicy], paths: Sequence[Path]) -> None:
+    repeated = [name for name, count in Counter(policy.name for policy in policies).items() if count > 1]
+    if repeated:
+        raise PipelineError(
+            f"two policies have the name {repeated[0]!r}",
+            where=", ".join(map(str, paths)),
+            expected="different names of the folders, which name the policies of vla-eval and lerobot-eval",
+            remedy="rename one of the folders, or leave one out",
+        )
 
 
 def _files(path: Path) -> tuple[list[Path], Path | None]:

@@ -191,6 +191,16 @@ def _parsed(text: str, replacement: Replacement) -> Bddl:
     return bddl.parse(text, str(replacement))
 
 
+def carried_task(task: EvaluationTask) -> Task | None:
+    """Return the LIBERO task that an evaluation task of the source ``goals`` carries to another scene.
+
+    Return ``None`` for a replaced goal.
+    """
+    if CARRIED not in task.name:
+        return None
+    return find_task(task.suite, task.name.removeprefix(task.base + CARRIED).rpartition("_state")[0])
+
+
 def goal_task(task: EvaluationTask) -> tuple[Task, Hashable]:
     """Return the LIBERO task of an evaluation task of the source ``goals``, and the goal that it asks for in its scene.
 
@@ -198,10 +208,10 @@ def goal_task(task: EvaluationTask) -> tuple[Task, Hashable]:
         PipelineError: if there is no such goal.
     """
     base = find_task(task.suite, task.base)
-    if CARRIED in task.name:
-        asked = task.name.removeprefix(task.base + CARRIED).rpartition("_state")[0]
-        base = carried(find_task(task.suite, asked), base)
-        return base, definition_of(base).asked
+    asked = carried_task(task)
+    if asked is not None:
+        played = carried(asked, base)
+        return played, definition_of(played).asked
     replacement = find_replacement(base, task.name)
     definition = _parsed(replacement.bddl_text(base), replacement)
     return replace(base, instruction=replacement.instruction), definition.asked

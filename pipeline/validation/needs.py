@@ -190,7 +190,7 @@ class Amounts(NamedTuple):
         twins: number of clean twins.
         planned: number of planned episodes.
         twin_steps: steps of all clean twins.
-        mean_steps: mean steps of a planned episode; episodes are spread evenly over the tasks.
+        mean_steps: mean steps of a planned episode; tasks count by their ``task_weights``.
     """
 
     twins: int
@@ -202,7 +202,8 @@ class Amounts(NamedTuple):
     def of(cls, tasks: Mapping[Task, list[int]], plan: PlanConfig) -> Amounts:
         """Compute the size of a run from the steps of each demonstration of each task (see ``lengths``)."""
         steps = list(tasks.values())
-        mean_steps = float(np.mean([np.mean(task) for task in steps]))
+        weights = [plan.task_weights.get(str(task), 1.0) for task in tasks]
+        mean_steps = float(np.average([np.mean(task) for task in steps], weights=weights))
         return cls(sum(map(len, steps)), sum(plan.episodes.values()), sum(map(sum, steps)), mean_steps)
 
     @property
