@@ -60,12 +60,19 @@ def _text(dumper: _StrictDumper, text: str) -> yaml.Node:
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else "'")
 
 
+def _list(dumper: _StrictDumper, entries: list[Any]) -> yaml.Node:
+    """Represent a list, on one line if it has no list or mapping."""
+    flat = not any(isinstance(entry, list | dict) for entry in entries)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", entries, flow_style=flat)
+
+
 _StrictDumper.add_representer(str, _text)
+_StrictDumper.add_representer(list, _list)
 
 
 def dump(content: Any) -> str:
-    """Return the YAML of plain values, which ``StrictLoader`` reads as the same values; short lists are on one line."""
-    return str(yaml.dump(content, Dumper=_StrictDumper, sort_keys=False, default_flow_style=None, width=120))
+    """Return the YAML of plain values, which ``StrictLoader`` reads as the same values."""
+    return str(yaml.dump(content, Dumper=_StrictDumper, sort_keys=False, default_flow_style=False, width=120))
 
 
 class FastStrictLoader(_EachKeyOnce, yaml.CSafeLoader):

@@ -379,7 +379,8 @@ def _changed(content: Mapping[str, Any], focused: Focused, name: str) -> dict[st
     axes = dict(plan.get("axes") or {})
     for axis, levels in focused.levels.items():
         axes[axis] = {**(axes.get(axis) or {}), "levels": levels}
-    plan |= {"axes": axes, "episodes": focused.episodes, "task_weights": focused.task_weights}
+    weights = {task: weight for task, weight in focused.task_weights.items() if weight != 1}
+    plan |= {"axes": axes, "episodes": focused.episodes, "task_weights": weights}
     export: dict[str, Any] = {}
     for key, options in (content.get("export") or {}).items():
         unnamed = {field: value for field, value in options.items() if field != "name"} if options else options
@@ -393,7 +394,7 @@ def _comment(focused: Focused, results: Sequence[Path], source: Path, limits: Li
     lines = [
         f"Written by `python -m pipeline focus` from {str(source)!a}, by failures of policies in",
         *(f"  {str(path)!a}" for path in results),
-        f"Counted episodes: {counted!a}; left out, of other tasks, axes or levels: {focused.left_out}.",
+        f"Counted episodes: {ascii(counted)[1:-1]}; left out, of other tasks, axes or levels: {focused.left_out}.",
         "",
         f"after = c * before * smoothed rate, from {limits.floor:g} to {limits.cap:g} times before; c makes the sum 1.",
         f"The smoothed rate counts {PRIOR} more episodes with the mean rate; those of tasks are relative to axes.",
@@ -403,7 +404,7 @@ def _comment(focused: Focused, results: Sequence[Path], source: Path, limits: Li
     return "".join(f"# {line}".rstrip() + "\n" for line in lines)
 
 
-HEADINGS = ("for", "name", "failed", "rate (95 %)", "smoothed", "before", "after", "written", "note")
+HEADINGS = ("for", "failed", "rate (95 %)", "smoothed", "before", "after", "written", "note", "name")
 
 
 def table(reasons: Sequence[Reason]) -> list[list[str]]:
@@ -417,7 +418,7 @@ def table(reasons: Sequence[Reason]) -> list[list[str]]:
         shares = ["-" if share is None else _percent(share) for share in (reason.before, reason.after)]
         written = "-" if reason.written is None else f"{reason.written:g}"
         counts = f"{reason.failures} of {reason.episodes}"
-        rows.append([reason.kind, reason.name, counts, rate, smooth, *shares, written, reason.note])
+        rows.append([reason.kind, counts, rate, smooth, *shares, written, reason.note, reason.name])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
 
