@@ -33,14 +33,15 @@ class TrainingConfig(Frozen):
         batch_size: frames of a step.
         learning_rate: learning rate of AdamW, which falls to a hundredth along a cosine.
         save_every: steps between two checkpoints, the largest loss of a kill.
-        proprioception: policies get the state; without it they get the two views and the sentence.
+        proprioception: ``true`` if policies get the state, ``relative`` for the state relative to the episode's first.
+            Policies without it get the two views and the sentence.
     """
 
     steps: int = Field(ge=1)
     batch_size: int = Field(ge=1)
     learning_rate: float = Field(gt=0)
     save_every: int = Field(ge=1)
-    proprioception: bool = True
+    proprioception: bool | Literal["relative"] = True
 
 
 class EvaluationConfig(Frozen):

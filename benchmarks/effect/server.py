@@ -3,13 +3,18 @@
 python benchmarks/effect/server.py --args.folder data/effect/policies/clean_seed0_... --address 127.0.0.1:8000
 """
 
+import json
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import sentences
 import torch
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
-from training import IMAGES, SENTENCE, STATE, pixels
+from numpy.typing import NDArray
+from states import relative
+from training import IMAGES, PROPRIOCEPTION, SENTENCE, STATE, pixels
 from vla_eval.model_servers.base import ModelServer, SessionContext
 from vla_eval.model_servers.serve import run_server
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, STATE_EEF_POS_AA_GRIP, DimSpec
@@ -33,15 +38,25 @@ class SentenceServer(ModelServer):  # type: ignore[misc]
         self._policy.eval()
         self._before, self._after = make_pre_post_processors(self._policy.config, folder)
         self._vectors = sentences.read()
+        self._is_relative = json.loads((Path(folder) / PROPRIOCEPTION).read_text()) == "relative"
+        self._first: dict[str, NDArray[np.float32]] = {}
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
         size = self._policy.config.image_features[IMAGES["image"]].shape[1:]
         batch = {IMAGES[VIEWS[view]]: pixels(resized(frame, *size)[None]) for view, frame in obs["images"].items()}
-        batch[STATE] = torch.from_numpy(obs["states"].copy())[None]
+        batch[STATE] = torch.from_numpy(self._state(obs["states"], ctx))[None]
         batch[SENTENCE] = torch.from_numpy(sentences.vector(obs["task_description"], self._vectors))[None]
         with torch.inference_mode():
             chunk = self._policy.predict_action_chunk(self._before(batch))
         await ctx.send_action({"actions": self._after(chunk)[0, : self._policy.config.n_action_steps].numpy()})
+
+    def _state(self, state: NDArray[np.float32], ctx: SessionContext) -> NDArray[np.float32]:
+        """Return the state (8,) that the policy was trained with."""
+        if not self._is_relative:
+            return np.array(state)
+        if ctx.is_first:
+            self._first[ctx.session_id] = np.array(state)
+        return relative(state[None], self._first[ctx.session_id])[0]
 
     def get_observation_params(self) -> dict[str, Any]:
         return {"send_wrist_image": True, "send_state": True, "quat_no_antipodal": True}

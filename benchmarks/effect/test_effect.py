@@ -13,6 +13,7 @@ from typing import Any
 
 import episodes
 import evaluation
+import mujoco
 import numpy as np
 import pytest
 import results
@@ -20,6 +21,7 @@ import sentences
 import yaml
 from conftest import REPOSITORY, STOVE, link_testset, memory, once, short_demos, tiny_config, whole  # noqa: F401
 from experiment import Experiment, read
+from states import relative_by_episode
 from told import every_told, find_tasks, goals_in
 
 from pipeline.__main__ import main
@@ -224,7 +226,7 @@ def small(folder: Path, demos: Path) -> Path:
             **{"chunk_size": 100, "n_action_steps": 40, "dim_model": 16, "n_heads": 2, "dim_feedforward": 16},
             **{"n_encoder_layers": 1, "use_vae": False, "dropout": 0.0},
         },
-        "training": {"steps": 4, "batch_size": 2, "learning_rate": 1e-3, "save_every": 2},
+        "training": {"steps": 4, "batch_size": 2, "learning_rate": 1e-3, "save_every": 2, "proprioception": "relative"},
         "evaluation": {"states": 1, "libero_plus": {}, "reading_states": 1},
     }
     file = folder / "experiment.yaml"
@@ -257,6 +259,36 @@ def test_a_batch_has_the_actions_that_follow_and_what_was_told(tmp_path: Path, m
         assert actions[:, 0].tolist() == [min(number + step, end - 1) for step in range(100)]
         assert pad.tolist() == [number + step >= end for step in range(100)]
         assert told.tolist() == vectors[text].tolist()
+
+
+def test_relative_states_do_not_depend_on_the_place_of_the_episode() -> None:
+    """All states are moved by one rotation and one translation, computed by matrices of MuJoCo."""
+    draws = np.random.default_rng(0)
+    states = draws.uniform(-1, 1, (6, 8)).astype(np.float32)
+    turn = matrix(np.array([0.3, -1.0, 0.7]))
+    moved = states.copy()
+    for state, place in zip(states, moved, strict=True):
+        place[:3] = turn @ state[:3] + [0.4, -0.2, 0.1]
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, (turn @ matrix(state[3:6])).ravel())
+        rotation_vector = np.empty(3)
+        mujoco.mju_quat2Vel(rotation_vector, quaternion, 1.0)
+        place[3:6] = rotation_vector
+    lengths = np.array([4, 2])
+    relative = relative_by_episode(states, lengths)
+    assert relative_by_episode(moved, lengths) == pytest.approx(relative, abs=1e-5)
+    assert relative[[0, 4], :6] == pytest.approx(np.zeros((2, 6)), abs=1e-6)
+    assert relative[:, 6:].tolist() == states[:, 6:].tolist()
+    assert relative[1, :3] == pytest.approx(matrix(states[0, 3:6]).T @ (states[1, :3] - states[0, :3]), abs=1e-5)
+
+
+def matrix(rotation_vector: Any) -> Any:
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), by MuJoCo."""
+    quaternion, result = np.empty(4), np.empty(9)
+    angle = np.linalg.norm(rotation_vector)
+    mujoco.mju_axisAngle2Quat(quaternion, np.asarray(rotation_vector, float) / angle, angle)
+    mujoco.mju_quat2Mat(result, quaternion)
+    return result.reshape(3, 3)
 
 
 class StoppedError(Exception):

@@ -21,6 +21,7 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 from numpy.typing import NDArray
 from sentences import SIZE, Vectors, vector
+from states import relative_by_episode
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from pipeline.files import remove, replaced
@@ -39,6 +40,9 @@ CALIBRATION_FRAMES = 64
 """Number of frames that set the backbone's normalisation."""
 
 LOG_EVERY = 50
+
+PROPRIOCEPTION = "proprioception.json"
+"""File of a policy with the value of this setting, which its server needs."""
 
 Batch = dict[str, torch.Tensor]
 
@@ -100,6 +104,7 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
     with replaced(out) as folder:
         for part in (policy, before, after):
             part.save_pretrained(folder)
+        (folder / PROPRIOCEPTION).write_text(json.dumps(config.proprioception))
         (folder / "training.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in log))
     remove(work)
 
@@ -141,6 +146,8 @@ class Steps:
         self._dataset = dataset
         self._chunk = np.arange(configuration(experiment).chunk_size)
         self._ends = np.repeat(np.cumsum(dataset.lengths), dataset.lengths)
+        is_relative = experiment.training.proprioception == "relative"
+        self._state = relative_by_episode(dataset.state, dataset.lengths) if is_relative else dataset.state
         self._sentences = np.stack([vector(row["instruction"], vectors) for row in dataset.episodes])
         self._episode = np.repeat(np.arange(len(dataset.lengths)), dataset.lengths)
 
@@ -151,7 +158,7 @@ class Steps:
         last = self._ends[frames, None] - 1
         return {
             **{key: pixels(self._dataset.images[view][frames]) for view, key in IMAGES.items()},
-            STATE: torch.from_numpy(self._dataset.state[frames]),
+            STATE: torch.from_numpy(self._state[frames]),
             SENTENCE: torch.from_numpy(self._sentences[self._episode[frames]]),
             ACTION: torch.from_numpy(self._dataset.action[np.minimum(following, last)]),
             "action_is_pad": torch.from_numpy(following > last),
@@ -160,7 +167,7 @@ class Steps:
     def statistics(self) -> dict[str, Mapping[str, torch.Tensor]]:
         """Compute mean and standard deviation of each feature except the sentence; images by channel."""
         statistics = {key: _of_channels(self._dataset.images[view]) for view, key in IMAGES.items()}
-        for key, values in ((STATE, self._dataset.state), (ACTION, self._dataset.action)):
+        for key, values in ((STATE, self._state), (ACTION, self._dataset.action)):
             statistics[key] = {
                 "mean": torch.from_numpy(values.mean(axis=0)),
                 "std": torch.from_numpy(values.std(axis=0)),
