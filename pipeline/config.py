@@ -329,9 +329,9 @@ class Config(Frozen):
     @model_validator(mode="after")
     def _sections_agree(self) -> Config:
         chosen, axes = select_tasks(self.demos.tasks), self.plan.axes
-        for task in self.plan.task_weights:
-            if task not in map(str, chosen):
-                raise ValueError(f"plan.task_weights: demos.tasks does not select {task!r}; expected <suite>/<task>")
+        for name in self.plan.task_weights:
+            if name not in map(str, chosen):
+                raise ValueError(f"plan.task_weights: demos.tasks does not select {name!r}; expected <suite>/<task>")
         if axes.disturbance and self.replay.noops != "drop":
             raise ValueError("the axis disturbance requires replay.noops: drop, as pushes count steps without no-ops")
         if axes.disturbance and self.replay.mode == "open_loop":

@@ -56,7 +56,7 @@ class SentenceServer(ModelServer):  # type: ignore[misc]
             return np.array(state)
         if ctx.is_first:
             self._first[ctx.session_id] = np.array(state)
-        return relative(state[None], self._first[ctx.session_id])[0]
+        return np.asarray(relative(state[None], self._first[ctx.session_id])[0])
 
     def get_observation_params(self) -> dict[str, Any]:
         return {"send_wrist_image": True, "send_state": True, "quat_no_antipodal": True}

@@ -16,6 +16,7 @@ from pipeline.evaluation.focus import PRIOR, Attempt, Focused, Limits, Reason, _
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.formats.rlds import RldsConfig
 from pipeline.libero.tasks import tasks
 from pipeline.planning.plan import apportion
 from pipeline.seeding import digest
@@ -191,8 +192,11 @@ def test_a_configuration_is_written_and_read_again(tmp_path: Path, capsys: pytes
     focused = json.loads(printed.splitlines()[-1])
     written = load(out)
     assert (written.name, written.plan.seed, written.folder) == ("second", 3, tmp_path / "1e5")
-    assert (written.export.formats["rlds"].shards, written.export.formats["rlds"].name) == (2, "libero_second")
+    rlds = written.export.formats["rlds"]
+    assert isinstance(rlds, RldsConfig)
+    assert (rlds.shards, rlds.name) == (2, "libero_second")
     assert written.plan.episodes == focused["episodes"] == {"camera": 5, "robot": 15}
+    assert written.plan.axes.robot is not None
     assert Counter(written.plan.axes.robot.levels) == {2: 10, 4: 10}, "no level that the first configuration leaves out"
     assert len(focused["task_weights"]) == len(tasks("libero_goal"))
     assert written.plan.task_weights == {

@@ -86,6 +86,13 @@ def test_quotas_are_spread_evenly_and_twins_complete() -> None:
             assert row.instruction != twin.instruction
 
 
+@given(wanted=st.integers(1, 500), number=st.integers(1, 60))
+def test_equal_weights_spread_evenly_with_the_first_ahead(wanted: int, number: int) -> None:
+    """As plans before weights were spread: quotient for every task, and one more for as many as the remainder."""
+    quotient, remainder = divmod(wanted, number)
+    assert plan.apportion(wanted, [1.0] * number) == [quotient + (place < remainder) for place in range(number)]
+
+
 def test_round_trip(tmp_path: Path) -> None:
     rows = plan.make(entries(), config(), REPLAY, NO_TESTS)
     plan.write(rows, tmp_path / "plan.parquet")
