@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from results import PolicyResults, read
+from told import at_own_place
 
 from pipeline.evaluation.results import EpisodeResult, Trial
 from pipeline.evaluation.statistics import Pair, compare, paired, success_rate, wilson
 from pipeline.files import replaced, write
+from pipeline.libero.tasks import tasks
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 LOG = Path(__file__).resolve().parents[1] / "LOG.md"
@@ -28,13 +30,17 @@ LINES = {
     "language": "language",
     "pose": "pose",
     "camera": "camera, noise",
-    "goal": "held-out goals",
+    "goal": "held-out goals elsewhere",
+    "goal, own place": "held-out goals at their own place",
 }
-LINE_OF = {axis: axis for axis in LINES} | {"noise": "camera"}
+OWN_PLACE = ", own place"
+"""End of the names of lines and kinds whose thing stands in the scene where it stands in the asked task's own scene."""
 KINDS = {
     "own": "the scene's own instruction",
-    "carried": "another task's, in the plan",
-    "held out": "another task's, held out",
+    "carried": "another task's in the plan, elsewhere",
+    "carried, own place": "another task's in the plan, at its own place",
+    "held out": "another task's held out, elsewhere",
+    "held out, own place": "another task's held out, at its own place",
     "nothing": "nothing",
 }
 COLOURS = ("#6b7d94", "#e59a00", "#1f9e82", "#9467d6")
@@ -43,11 +49,19 @@ Rows = Mapping[int, Sequence[EpisodeResult]]
 """Seed to the episodes of an arm's policy with that seed."""
 
 
+def line_of(row: EpisodeResult) -> str:
+    """Return the line of the table that a result belongs to."""
+    if row.axis != "goal":
+        return "camera" if row.axis == "noise" else row.axis
+    (asked,) = (task.name for task in tasks(row.suite) if task.instruction == row.instruction)
+    return row.axis + (OWN_PLACE if at_own_place(row.suite, row.base, asked) else "")
+
+
 def of_line(results: Sequence[PolicyResults], line: str) -> dict[str, Rows]:
     """Select the episodes of one line of the table by arm."""
     episodes: dict[str, dict[int, list[EpisodeResult]]] = defaultdict(dict)
     for policy in results:
-        episodes[policy.arm][policy.seed] = [row for row in policy.rows if LINE_OF[row.axis] == line]
+        episodes[policy.arm][policy.seed] = [row for row in policy.rows if line_of(row) == line]
     return dict(episodes)
 
 
@@ -55,7 +69,7 @@ def lines_of(results: Sequence[PolicyResults]) -> list[str]:
     """List the lines of the table that have episodes."""
     lines_with_episodes: set[str] = set()
     for policy in results:
-        lines_with_episodes |= {LINE_OF[row.axis] for row in policy.rows}
+        lines_with_episodes |= set(map(line_of, policy.rows))
     return [line for line in LINES if line in lines_with_episodes]
 
 
@@ -131,11 +145,15 @@ def reading_by_kind(results: Sequence[PolicyResults], arm: str) -> dict[str, Cou
     A reached goal is the ``asked`` one, that of the scene's own (``usual``) task, or ``another``; else ``none``.
     """
     counts: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
+    (suite,) = {name.partition("/")[0] for name in results[0].settings["run"]["demos"]["tasks"]}
     for row in _told(results, arm):
         outcomes = {None: "none", row["scene"]: "usual"}
+        kind = row["kind"]
         if row["asked"]:
             outcomes[row["asked"]] = "asked"
-        counts[row["kind"]][outcomes.get(row["reached"], "another")] += 1
+        if f"{kind}{OWN_PLACE}" in KINDS and at_own_place(suite, row["scene"], row["asked"]):
+            kind += OWN_PLACE
+        counts[kind][outcomes.get(row["reached"], "another")] += 1
     return counts
 
 
@@ -193,11 +211,11 @@ def _difference_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
 def _reading_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     """Return the counts of reached goals by instruction and arm."""
     arms = arms_of(results)
-    tasks = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
+    names = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
     reached = {arm: reading(results, arm) for arm in arms}
     rows = [["told", *arms]]
     for instruction in reached[arms[0]]:
-        cells = [_reached(counts[instruction], instruction, tasks) for counts in reached.values()]
+        cells = [_reached(counts[instruction], instruction, names) for counts in reached.values()]
         rows.append([instruction or "nothing", *cells])
     return rows
 
@@ -216,10 +234,10 @@ def _kind_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     return rows
 
 
-def _reached(counts: Counter[str | None], instruction: str, tasks: Sequence[str]) -> str:
+def _reached(counts: Counter[str | None], instruction: str, names: Sequence[str]) -> str:
     asked = instruction.replace(" ", "_")
-    asked_count = [str(counts[asked])] if asked in tasks else []
-    other_counts = [f"{_short(task)} {counts[task]}" for task in tasks if counts[task] and task != asked]
+    asked_count = [str(counts[asked])] if asked in names else []
+    other_counts = [f"{_short(task)} {counts[task]}" for task in names if counts[task] and task != asked]
     return f"{', '.join([*asked_count, *other_counts]) or 0} of {counts.total()}"
 
 

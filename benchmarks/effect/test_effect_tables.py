@@ -18,6 +18,11 @@ from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 
 EFFECT = Path(__file__).parent
+AXES = ("clean", "robot", "language", "pose", "camera", "noise")
+BUTTER, BBQ, ORANGE, TOMATO = (
+    f"pick_up_the_{thing}_and_place_it_in_the_basket"
+    for thing in ("butter", "bbq_sauce", "orange_juice", "tomato_sauce")
+)
 
 
 def row(axis: str, number: int, success: bool, policy: str) -> EpisodeResult:
@@ -36,7 +41,7 @@ def told_row(scene: str, kind: str, asked: str | None, reached: str | None) -> d
 
 def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
     """Return results: of each axis the first ``solved`` of ten tasks, and one of two instructions, are solved."""
-    rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in comparison.LINE_OF for number in range(10)]
+    rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in AXES for number in range(10)]
     told = [("own", "stove", "stove"), ("own", "put_the_bowl_on_the_plate", "stove"), ("nothing", None, "stove")]
     reading = [told_row("stove", kind, asked, reached) for kind, asked, reached in told]
     settings = {
@@ -67,7 +72,7 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     robot = next(one for one in comparison.differences(found) if one["line"] == "robot")
     assert robot["value"] == pytest.approx((18 - 6) / 20)
     assert robot["resampled"] == "10 trials", "both seeds act in the same ten"
-    assert robot["holm"] == pytest.approx(5 * robot["p_value"]), "camera and noise have more trials"
+    assert robot["holm"] == pytest.approx(4 * robot["p_value"]), "camera and noise have more trials"
     text = comparison.markdown(found)
     assert "| robot | 10 | 30 % (40, 20) | 90 % (90, 90) |" in text
     assert "| camera, noise | 20 | 30 % (40, 20) | 90 % (90, 90) |" in text
@@ -79,22 +84,30 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
 
 
 def test_reached_goals_of_several_scenes_are_counted_by_kind() -> None:
-    """A goal is the asked one, the scene's usual one, another, or none; in every scene the usual one is its own."""
+    """In the BDDL files, the butter's scene has the tomato sauce at its own place, and the barbecue sauce elsewhere."""
     told = [
-        *(("salt", "own", "salt", "salt"), ("salt", "own", "salt", "milk"), ("milk", "own", "milk", None)),
-        *(
-            ("salt", "held out", "milk", "salt"),
-            ("salt", "held out", "milk", "milk"),
-            ("milk", "carried", "salt", "tea"),
-        ),
-        *(("milk", "nothing", None, "milk"), ("milk", "nothing", None, "salt")),
+        *((BUTTER, "own", BUTTER, BUTTER), (BUTTER, "own", BUTTER, BBQ), (ORANGE, "own", ORANGE, None)),
+        *((BUTTER, "held out", BBQ, BUTTER), (BUTTER, "held out", BBQ, BBQ), (ORANGE, "held out", BUTTER, BUTTER)),
+        *((BUTTER, "carried", TOMATO, BUTTER), (BUTTER, "carried", ORANGE, TOMATO)),
+        *((BUTTER, "nothing", None, BUTTER), (BUTTER, "nothing", None, BBQ)),
     ]
-    found = [replace(of_policy("ours", seed, 9), reading=[told_row(*row) for row in told]) for seed in (0, 1)]
-    text = comparison.markdown(found)
+    demos = {"tasks": [f"libero_object/{task}" for task in (BUTTER, BBQ, ORANGE, TOMATO)]}
+    settings = {"arms": {"ours": []}, "run": {"demos": demos}}
+    reading = [told_row(*row) for row in told]
+    results = [replace(of_policy("ours", seed, 9), settings=settings, reading=reading) for seed in (0, 1)]
+    text = comparison.markdown(results)
     assert "| the scene's own instruction | ours | 2 | - | 2 of 6 | 2 of 6 |" in text
-    assert "| another task's, in the plan | ours | 0 | 0 | 2 of 2 | 0 of 2 |" in text
-    assert "| another task's, held out | ours | 2 | 2 | 0 of 4 | 0 of 4 |" in text
+    assert "| another task's in the plan, elsewhere | ours | 0 | 0 | 2 of 2 | 0 of 2 |" in text
+    assert "| another task's in the plan, at its own place | ours | 0 | 2 | 0 of 2 | 0 of 2 |" in text
+    assert "| another task's held out, elsewhere | ours | 2 | 2 | 0 of 4 | 0 of 4 |" in text
+    assert "| another task's held out, at its own place | ours | 2 | 0 | 0 of 2 | 0 of 2 |" in text
     assert "| nothing | ours | - | 2 | 2 of 4 | 0 of 4 |" in text
+
+
+def test_held_out_goals_have_a_line_for_each_kind_of_place() -> None:
+    task = EvaluationTask("goals", "libero_object", BUTTER, "name", "goal", "bbq_sauce", 0, 0)
+    for asked, line in ((BBQ, "goal"), (TOMATO, "goal, own place")):
+        assert comparison.line_of(result(task, instruction=asked.replace("_", " "))) == line
 
 
 def test_holms_correction() -> None:

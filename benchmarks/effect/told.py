@@ -2,7 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
+
+import numpy as np
 
 from pipeline.axes.goal import held_out, usable
 from pipeline.libero import bddl
@@ -10,6 +13,9 @@ from pipeline.libero.bddl import Fact
 from pipeline.libero.carried import carried, definition_of
 from pipeline.libero.tasks import find_task
 from pipeline.types import Task
+
+SAME_PLACE_M = 0.05
+"""Distance below which two places of a thing count as equal."""
 
 Kind = Literal["own", "carried", "held out", "nothing"]
 """Kind of an instruction in a scene: LIBERO's own, another task's that plans may carry there, another task's that no
@@ -65,6 +71,23 @@ def every_told(tasks: Sequence[Task]) -> list[Told]:
     for scene in scenes_of(tasks):
         listed += told_in(scene, tasks)
     return listed
+
+
+@cache
+def at_own_place(suite: str, scene: str, asked: str) -> bool:
+    """Return whether the thing that a task takes first stands in another scene where it stands in the task's own.
+
+    A policy that has learned a place for each instruction reaches such a goal without looking for the thing.
+
+    Args:
+        suite: suite of both tasks.
+        scene: name of the task whose scene it is.
+        asked: name of the task that is carried to the scene.
+    """
+    task = find_task(suite, asked)
+    own, played = definition_of(task), definition_of(carried(task, find_task(suite, scene)))
+    apart_m = np.subtract(own.centres_m[own.targets[0]], played.centres_m[played.targets[0]])
+    return bool(np.linalg.norm(apart_m) < SAME_PLACE_M)
 
 
 def goals_in(scene: Task, tasks: Sequence[Task]) -> dict[str, tuple[Fact, ...]]:

@@ -153,7 +153,10 @@ class Steps:
 
     def batch(self, draws: np.random.Generator, size: int) -> Batch:
         """Sample frames with replacement; return them before normalisation."""
-        frames = draws.integers(len(self._ends), size=size)
+        return self.of_frames(draws.integers(len(self._ends), size=size))
+
+    def of_frames(self, frames: NDArray[np.int64]) -> Batch:
+        """Return the frames with these numbers, counted over all episodes, before normalisation."""
         following = frames[:, None] + self._chunk
         last = self._ends[frames, None] - 1
         return {
