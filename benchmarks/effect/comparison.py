@@ -21,7 +21,7 @@ LOG = Path(__file__).resolve().parents[1] / "LOG.md"
 FURTHER = Path(__file__).with_name("further") / "results"
 """Folder with one subfolder of results for each further experiment."""
 
-BESIDE = {"starts": "no_state"}
+BESIDE = {"starts": "no_state", "goals_many": "goals"}
 """Further experiment to a second one whose arms join its table: both share policies, tests and demonstrations."""
 
 LINES = {

@@ -48,8 +48,12 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
-    assert further.keys() == {"pre_norm", "no_state", "starts", "goals"}
-    goals = further.pop("goals")
+    assert further.keys() == {"pre_norm", "no_state", "starts", "goals", "goals_many"}
+    goals, many = further.pop("goals"), further.pop("goals_many")
+    assert many == goals.model_copy(update={"data": many.data, "arms": many.arms, "decisions": many.decisions})
+    same = {"plan": {"episodes"}}
+    assert many.run.model_dump(exclude=same) == goals.run.model_dump(exclude=same)
+    assert [goals.run.plan.episodes, many.run.plan.episodes] == [{"goal": 70}, {"goal": 140}]
     assert goals.policy == further["no_state"].policy
     assert goals.training == further["no_state"].training.model_copy(update={"steps": 8_000})
     for one in further.values():
