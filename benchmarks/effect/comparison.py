@@ -170,7 +170,8 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     if rows:
         text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n"
         text += _table(rows)
-    if len({row["scene"] for policy in results for row in policy.reading}) > 1:
+    readings = chain.from_iterable(policy.reading for policy in results)
+    if len({row["scene"] for row in readings}) > 1:
         text += "\nReached goals by instruction, all scenes and seeds together:\n\n"
         return text + _table(_kind_rows(results))
     text += "\nEpisodes that reach the goal of the instruction, and other reached goals by name:\n\n"

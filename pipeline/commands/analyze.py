@@ -6,7 +6,16 @@ from typing import Any
 
 import click
 
-from pipeline.commands.base import PATH, Command, LazyGroup, Listed, config_argument, example, open_run
+from pipeline.commands.base import (
+    PATH,
+    Command,
+    LazyGroup,
+    Listed,
+    config_argument,
+    example,
+    open_run,
+    result_paths_argument,
+)
 from pipeline.errors import PipelineError
 from pipeline.files import refuse_other_file, write_json
 
@@ -59,14 +68,7 @@ def report(folders: tuple[Path, ...], across: tuple[Any, ...], out: Path) -> Non
 
 
 @click.command(cls=Command, epilog=example("analyze table results/act results/vla_eval --out table"))
-@click.argument(
-    "results",
-    metavar="PATH...",
-    nargs=-1,
-    required=True,
-    type=PATH,
-    help="Folders of `evaluate`; folders or files of vla-eval (*_aggregate.json) and lerobot-eval (eval_info.json).",
-)
+@result_paths_argument
 @click.option(
     "--out",
     metavar="NAME",

@@ -124,6 +124,15 @@ def example(*commands: str) -> str:
 
 PATH = click.Path(path_type=Path)
 
+result_paths_argument = click.argument(
+    "results",
+    metavar="PATH...",
+    nargs=-1,
+    required=True,
+    type=PATH,
+    help="Folders of `evaluate`; folders or files of vla-eval (*_aggregate.json) and lerobot-eval (eval_info.json).",
+)
+
 config_argument = click.argument(
     "config", metavar="CONFIG", type=PATH, help="File of the run's configuration, such as configs/starter.yaml."
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.base import PATH, Command, example
+from pipeline.commands.base import PATH, Command, example, result_paths_argument
 
 
 @click.command(
@@ -16,14 +16,7 @@ from pipeline.commands.base import PATH, Command, example
         "focus results/act results/vla_eval --from configs/small.yaml --out configs/second.yaml --episodes 500",
     ),
 )
-@click.argument(
-    "results",
-    metavar="PATH...",
-    nargs=-1,
-    required=True,
-    type=PATH,
-    help="Folders of `evaluate`; folders or files of vla-eval (*_aggregate.json) and lerobot-eval (eval_info.json).",
-)
+@result_paths_argument
 @click.option("--from", "source", metavar="CONFIG", required=True, type=PATH, help="Configuration to start from.")
 @click.option(
     "--out",

@@ -42,6 +42,8 @@ LEVEL_ENTRIES = 20
 
 LEAST_WEIGHT = 0.01
 
+NO_RESULTS = "no results"
+
 Kind = Literal["axis", "episodes", "level", "task"]
 
 
@@ -197,15 +199,19 @@ def focus(config: Config, results: Sequence[Attempt], episodes: int | None, limi
             remedy="evaluate the policy on --source libero_plus, own or goals",
         )
     rates = _rates(by_axes, [*axes, *plan.episodes])
-    reasons = [_reason("axis", axis, by_axes.get(axis, ()), rates[axis]) for axis in axes]
+    reasons: list[Reason] = []
+    for axis in axes:
+        of_axis = by_axes.get(axis, ())
+        note = "" if of_axis else NO_RESULTS
+        reasons.append(Reason("axis", axis, _failures(of_axis), len(of_axis), rates[axis], note=note))
     numbers, of_entries = _by_entry(plan.episodes, by_axes, rates, total, limits)
     levels: dict[str, list[int]] = {}
     of_levels: list[Reason] = []
     for axis, settings in axes.items():
         with_level = [attempt for attempt in by_axes.get(axis, ()) if attempt.level]
         if with_level and all(settings.levels_set_shares(task) for task in tasks):
-            levels[axis], of_axis = _by_level(axis, settings.levels, with_level, rates[axis], limits)
-            of_levels += of_axis
+            levels[axis], level_reasons = _by_level(axis, settings.levels, with_level, rates[axis], limits)
+            of_levels += level_reasons
     new_weights, of_tasks = _by_task(weights, by_axes, limits)
     return Focused(
         numbers,
@@ -317,11 +323,6 @@ def _shares(before: Mapping[str, float], rates: Mapping[str, float], limits: Lim
     return dict(zip(before, (shares / shares.sum()).tolist(), strict=True))
 
 
-def _reason(kind: Kind, name: str, results: Sequence[Attempt], rate: float, **fields: Any) -> Reason:
-    notes = [*([] if results else ["no results"]), *filter(None, [fields.pop("note", "")])]
-    return Reason(kind, name, _failures(results), len(results), rate, **fields, note=", ".join(notes))
-
-
 def _reasons(
     kind: Kind,
     results: Mapping[str, Sequence[Attempt]],
@@ -334,13 +335,20 @@ def _reasons(
     """Return the reason of each share."""
     reasons: list[Reason] = []
     for name, share in shares.items():
-        share_before = before[name] / sum(before.values())
-        note = "floor" if isclose(share, limits.floor * share_before) else ""
-        note = "cap" if isclose(share, limits.cap * share_before) else note
+        share_before, of_name = before[name] / sum(before.values()), results.get(name, ())
+        notes = [] if of_name else [NO_RESULTS]
         if kind != "task" and share * sum(written.values()) < 1:
-            note = "at least 1"
-        fields = {"before": share_before, "after": share, "written": written[name], "note": note}
-        reasons.append(_reason(kind, name, results.get(name, ()), rates[name], **fields))
+            notes.append("at least 1")
+        elif isclose(share, limits.cap * share_before):
+            notes.append("cap")
+        elif isclose(share, limits.floor * share_before):
+            notes.append("floor")
+        reasons.append(
+            Reason(
+                *(kind, name, _failures(of_name), len(of_name), rates[name]),
+                *(share_before, share, written[name], ", ".join(notes)),
+            )
+        )
     return reasons
 
 
@@ -357,14 +365,16 @@ def write(
     Raises:
         PipelineError: if the file exists, or has no name for a run; also as ``attempts`` and ``focus``.
     """
-    config, content = validate(read_content(source), source), read_content(source)
-    if out.exists():
+    content = read_content(source)
+    config = validate(content, source)
+    if out.exists() or out.is_symlink():
         raise PipelineError("the file exists, and may have been edited", where=out, remedy="choose another name")
     if not re.fullmatch(NAME, out.stem) or out.stem == config.name:
         raise PipelineError(
             f"the run would have the name {out.stem!r}",
             where=f"--out {out}",
             expected=f"another name than {config.name}, of small letters, digits and underscores, as <name>.yaml",
+            remedy="choose another file name",
         )
     focused = focus(config, attempts(results), episodes, limits)
     changed = _changed(content, focused, out.stem)
@@ -381,11 +391,17 @@ def _changed(content: Mapping[str, Any], focused: Focused, name: str) -> dict[st
         axes[axis] = {**(axes.get(axis) or {}), "levels": levels}
     weights = {task: weight for task, weight in focused.task_weights.items() if weight != 1}
     plan |= {"axes": axes, "episodes": focused.episodes, "task_weights": weights}
-    export: dict[str, Any] = {}
-    for key, options in (content.get("export") or {}).items():
-        unnamed = {field: value for field, value in options.items() if field != "name"} if options else options
-        export[key] = unnamed if isinstance(options, dict) else options
-    return {**content, "name": name, "plan": plan, **({"export": export} if "export" in content else {})}
+    changed = {**content, "name": name, "plan": plan}
+    if content.get("export"):
+        changed["export"] = {key: _unnamed(options) for key, options in content["export"].items()}
+    return changed
+
+
+def _unnamed(options: Any) -> Any:
+    """Return the options of a format without the name of its dataset; other values as they are."""
+    if not isinstance(options, dict):
+        return options
+    return {field: value for field, value in options.items() if field != "name"}
 
 
 def _comment(focused: Focused, results: Sequence[Path], source: Path, limits: Limits) -> str:

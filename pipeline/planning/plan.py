@@ -128,7 +128,8 @@ def apportion(total: int, weights: Sequence[float], least: int = 0) -> list[int]
         weights: weights, not all 0.
         least: smallest part.
     """
-    exact = [total * weight / sum(weights) for weight in weights]
+    sum_of_weights = sum(weights)
+    exact = [total * weight / sum_of_weights for weight in weights]
     parts = [max(least, int(part)) for part in exact]
     places = range(len(parts))
     while sum(parts) < total:

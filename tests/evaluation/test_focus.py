@@ -12,7 +12,7 @@ from pipeline.axes import level_of_test
 from pipeline.commands.command_line import run
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
-from pipeline.evaluation.focus import PRIOR, Attempt, Focused, Limits, Reason, _shares, attempts, focus
+from pipeline.evaluation.focus import PRIOR, Attempt, Focused, Limits, Reason, attempts, focus
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
@@ -126,13 +126,19 @@ def test_results_on_other_tasks_axes_and_levels_do_not_count() -> None:
 def test_every_floor_and_cap_is_kept(limits: Limits) -> None:
     """Also if they leave nothing to decide, with the rounding errors of any number of entries."""
     for number in range(1, 25):
-        weights = {f"libero_goal/{place}": 1.0 + place % 3 for place in range(number)}
-        rates = {name: (place + 1) / (number + 1) for place, name in enumerate(weights)}
-        shares = _shares(weights, rates, limits)
-        assert sum(shares.values()) == pytest.approx(1)
-        for name, share in shares.items():
-            factor = share * sum(weights.values()) / weights[name]
-            assert limits.floor - 1e-9 <= factor <= limits.cap + 1e-9
+        names = [str(task) for task in tasks("libero_90")[:number]]
+        results: list[Attempt] = []
+        for place, name in enumerate(names):
+            results += attempt("camera", place, number, task=name)
+        weights = {name: 1.0 + place % 3 for place, name in enumerate(names)}
+        plan = {"episodes": {"camera": 100}, "task_weights": weights}
+        planned = Config.model_validate({"name": "a", "demos": {"root": "demos", "tasks": names}, "plan": plan})
+        shares = reasons(focus(planned, results, None, limits), "task").values()
+        assert sum(reason.after or 0 for reason in shares) == pytest.approx(1)
+        for reason in shares:
+            assert reason.before
+            assert reason.after is not None
+            assert limits.floor - 1e-9 <= reason.after / reason.before <= limits.cap + 1e-9
 
 
 @pytest.mark.parametrize(
