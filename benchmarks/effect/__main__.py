@@ -16,24 +16,35 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import episodes
 import sentences
+import yaml
 from experiment import Experiment, read
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation import own_draws
+from pipeline.evaluation.results import REFUSED, EpisodeFiles, EpisodeResult
 from pipeline.evaluation.task_list import write_tasks
-from pipeline.files import checksum
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.files import checksum, write
 from pipeline.machine_code import ensure_fixed_machine_code
+from pipeline.planning import plan
 
 HERE = Path(__file__).resolve().parent
 sys.path.append(str(HERE.parent))
+
+
+class Trained(NamedTuple):
+    """Configuration and plan of a run that has all episodes of an experiment."""
+
+    file: Path
+    plan_file: Path
 
 
 class Work:
@@ -96,17 +107,19 @@ class Work:
         # The label has the weights' hash, as an earlier policy of the same settings has different results.
         label = f"{policy.name}_{weights[:8]}"
         folder = self.out / "evaluations" / label
-        tasks, libero_tasks = (self.out / "task_lists" / f"{label}{part}.json" for part in ("", "_own"))
         tested = evaluation.tested(self.experiment)
-        write_tasks(tested, 0, tasks)
-        server = running(str(HERE / "server.py"), "--args.folder", str(policy))
-        with self._timed(f"evaluation {policy.name}"), server as address:
-            words = ["evaluate", str(folder), "--server", address, "--label", label, "--tasks-from", str(tasks)]
-            run("-m", "pipeline", *words)
-            in_libero, black = [task for task in tested if task.source == "libero"], folder / "black"
-            write_tasks(in_libero, 0, libero_tasks)
-            words[1], words[-1] = str(black), str(libero_tasks)
-            run("-m", "pipeline", *words, "--black", "all")
+        in_libero = [task for task in tested if task.source == "libero"]
+        with (
+            self._timed(f"evaluation {policy.name}"),
+            running(str(HERE / "server.py"), "--args.folder", str(policy)) as address,
+        ):
+            server = ("--server", address, "--label", label)
+            rows = run_tests(tested, folder, *server)
+            seen = run_tests(in_libero, folder / "black", *server, "--black", "all")
+            if self.experiment.evaluation.held_out:
+                trained = self._trained(folder)
+                held_out = evaluation.held_out_tests(self.experiment, own_draws.planned(trained.plan_file))
+                rows += run_tests(held_out, folder / "held_out", *server, "--trained-on", str(trained.file))
             reading = evaluation.tell(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)
         losses = (policy / "training.jsonl").read_text().splitlines()
@@ -124,10 +137,20 @@ class Work:
             mode="json", exclude={"data", "decisions", "seeds"}, exclude_defaults=True
         )
         settings["run"] = self.experiment.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"})
-        rows = [row for row in EpisodeFiles(folder).rows() if row.trial[0] in tested]
-        seen = [row for row in EpisodeFiles(black).rows() if row.trial[0] in in_libero]
         nothing = [{"task": row.base, "state": row.number, "success": row.success} for row in seen]
         return PolicyResults(arm, seed, settings, made, rows, reading, nothing).write(kept)
+
+    def _trained(self, folder: Path) -> Trained:
+        """Write the perturbed episodes of all arms as the plan of one run, so that tests are equal for all arms."""
+        rows: list[plan.Row] = []
+        for arm in self.experiment.arms:
+            self.make_data(arm)
+            rows += episodes.trained_on(self.dataset(arm))
+        demos = self.experiment.run.model_dump(mode="json", include={"demos"}, exclude_defaults=True)
+        trained = Trained(folder / "trained.yaml", folder / "trained" / "plan.parquet")
+        write(trained.file, yaml.safe_dump({"name": "trained", "folder": str(folder), **demos}))
+        plan.write(rows, trained.plan_file)
+        return trained
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -148,6 +171,14 @@ class Work:
             seconds, cpu_s = taken.get(entry["part"], (0.0, 0.0))
             taken[entry["part"]] = [round(seconds + entry["seconds"], 1), round(cpu_s + entry["cpu_s"], 1)]
         return taken
+
+
+def run_tests(tests: Sequence[EvaluationTask], folder: Path, *options: str) -> list[EpisodeResult]:
+    """Evaluate on the tests without results in the folder; return the results of all tests whose scene was accepted."""
+    tasks, wanted = folder.with_name(f"{folder.name}_tasks.json"), set(tests)
+    write_tasks(tests, 0, tasks)
+    run("-m", "pipeline", "evaluate", str(folder), "--tasks-from", str(tasks), *options)
+    return [row for row in EpisodeFiles(folder).rows() if row.trial[0] in wanted and row.reason != REFUSED]
 
 
 def run(*words: str) -> None:

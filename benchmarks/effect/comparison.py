@@ -29,7 +29,12 @@ LINES = {
     "robot": "robot",
     "language": "language",
     "pose": "pose",
-    "camera": "camera, noise",
+    "camera": "camera",
+    "noise": "noise",
+    "camera, noise": "camera, noise",
+    "light": "light, held out",
+    "background": "background, held out",
+    "layout": "added objects, held out",
     "goal": "held-out goals elsewhere",
     "goal, own place": "held-out goals at their own place",
 }
@@ -49,10 +54,15 @@ Rows = Mapping[int, Sequence[EpisodeResult]]
 """Seed to the episodes of an arm's policy with that seed."""
 
 
-def line_of(row: EpisodeResult) -> str:
-    """Return the line of the table that a result belongs to."""
+def line_of(policy: PolicyResults, row: EpisodeResult) -> str:
+    """Return the line of the table that a policy's result belongs to.
+
+    Camera and noise share a line in experiments with few tests of both, those without held-out perturbations.
+    """
+    if row.axis in ("camera", "noise") and "held_out" not in policy.settings["evaluation"]:
+        return "camera, noise"
     if row.axis != "goal":
-        return "camera" if row.axis == "noise" else row.axis
+        return row.axis
     (asked,) = (task.name for task in tasks(row.suite) if task.instruction == row.instruction)
     return row.axis + (OWN_PLACE if at_own_place(row.suite, row.base, asked) else "")
 
@@ -61,7 +71,7 @@ def of_line(results: Sequence[PolicyResults], line: str) -> dict[str, Rows]:
     """Select the episodes of one line of the table by arm."""
     episodes: dict[str, dict[int, list[EpisodeResult]]] = defaultdict(dict)
     for policy in results:
-        episodes[policy.arm][policy.seed] = [row for row in policy.rows if line_of(row) == line]
+        episodes[policy.arm][policy.seed] = [row for row in policy.rows if line_of(policy, row) == line]
     return dict(episodes)
 
 
@@ -69,7 +79,7 @@ def lines_of(results: Sequence[PolicyResults]) -> list[str]:
     """List the lines of the table that have episodes."""
     lines_with_episodes: set[str] = set()
     for policy in results:
-        lines_with_episodes |= set(map(line_of, policy.rows))
+        lines_with_episodes |= {line_of(policy, row) for row in policy.rows}
     return [line for line in LINES if line in lines_with_episodes]
 
 

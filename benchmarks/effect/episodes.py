@@ -130,6 +130,13 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
     return rows + clean, [row for row in rows if row.role == "perturbed"] + clean
 
 
+def trained_on(dataset: Path) -> list[plan.Row]:
+    """Return the rows of a dataset's perturbed episodes in the plan, without unused candidates."""
+    trained = {row["episode_id"] for row in read(dataset).episodes}
+    rows = plan.read(dataset.with_suffix("") / "plan.parquet")
+    return [row for row in rows if row.role == "perturbed" and row.episode_id in trained]
+
+
 def _write(rows: Sequence[plan.Row], load: EpisodeLoader, frame_px: int, workers: Workers, file: Path) -> None:
     small = workers(partial(_small, load, frame_px), [row.episode_id for row in rows], "small frames")
     columns: dict[str, Any] = {}

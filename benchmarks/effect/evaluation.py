@@ -16,10 +16,12 @@ from told import Told, every_told, find_tasks, goals_in
 
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
+from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.own_draws import ATTEMPTS, PlannedDraws, draw
 from pipeline.evaluation.policies import Server, Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
-from pipeline.evaluation.tasks import EvaluationTask, goal_task, libero_task
+from pipeline.evaluation.tasks import EvaluationTask, balanced, goal_task, libero_task
 from pipeline.files import read_json, write_json
 from pipeline.libero.carried import carried, definition_of
 from pipeline.types import Task
@@ -40,6 +42,34 @@ def tested(experiment: Experiment) -> list[EvaluationTask]:
             chosen += select(tests)
     if wanted.held_out_goals:
         chosen += _held_out_goals(find_tasks(experiment.tasks), wanted.held_out_goals)
+    return chosen
+
+
+def held_out_tests(experiment: Experiment, trained: PlannedDraws) -> list[EvaluationTask]:
+    """Select held-out perturbations of each task, equally for all arms.
+
+    Each test has a sample that keeps its clearance from the episodes of all arms. ``evaluate --trained-on`` takes the
+    first such sample that the scene accepts.
+
+    Raises:
+        PipelineError: if a task has too few such perturbations.
+    """
+    chosen: list[EvaluationTask] = []
+    for task, (axis, number) in product(find_tasks(experiment.tasks), experiment.evaluation.held_out.items()):
+        candidates = Selection(source="own", suites=(task.suite,), tasks=(task.name,), axes=(axis,), episodes=number)
+        apart: list[EvaluationTask] = []
+        for test in select(candidates):
+            draws = (draw(test, candidates.seed, attempt) for attempt in range(ATTEMPTS))
+            if not all(trained.overlap(perturbation, task) for perturbation in draws):
+                apart.append(test)
+        if len(apart) < number:
+            raise PipelineError(
+                f"{len(apart)} held-out perturbations of {axis} are apart from all arms' episodes of {task.name}",
+                where=f"evaluation.held_out.{axis}",
+                expected=str(number),
+                remedy=f"ask for at most {len(apart)}, or plan fewer textures or objects",
+            )
+        chosen += balanced(apart, number, candidates.seed)
     return chosen
 
 

@@ -21,6 +21,9 @@ from pipeline.seeding import digest
 PlusAxis = Literal["robot", "language", "pose", "camera", "noise"]
 """Axes whose test tasks need no asset archive."""
 
+HeldOutAxis = Literal["light", "background", "layout"]
+"""Axes of the paper whose test tasks need the asset archive, tested by held-out perturbations of this project."""
+
 MOST_EPISODES = 350
 """Limit of the episodes of a policy's evaluation, about 25 minutes of two cores."""
 
@@ -50,6 +53,7 @@ class EvaluationConfig(Frozen):
     Attributes:
         states: number of LIBERO's initial states of each task, counted from the first.
         libero_plus: axis to the number of LIBERO-Plus's test tasks of each task.
+        held_out: axis to the number of held-out perturbations of each task, spread over the levels.
         held_out_goals: number of LIBERO's initial states of each scene, counted from the first, with each goal that no
             plan carries to the scene.
         reading_states: number of initial states of each scene, counted from the last, with each instruction.
@@ -57,16 +61,17 @@ class EvaluationConfig(Frozen):
 
     states: int = Field(ge=1, le=50)
     libero_plus: dict[PlusAxis, int]
+    held_out: dict[HeldOutAxis, int] = Field(default_factory=dict)
     held_out_goals: int = Field(default=0, ge=0, le=50)
     reading_states: int = Field(ge=0, le=50)
 
     def episodes(self, names: Sequence[str]) -> int:
         """Return the number of episodes of the tasks with these names, without those with black views."""
         instructions = every_told(find_tasks(names))
-        held_out = sum(told.kind == "held out" for told in instructions)
+        goals = sum(told.kind == "held out" for told in instructions)
         return (
-            len(names) * (self.states + sum(self.libero_plus.values()))
-            + held_out * self.held_out_goals
+            len(names) * (self.states + sum(self.libero_plus.values()) + sum(self.held_out.values()))
+            + goals * self.held_out_goals
             + len(instructions) * self.reading_states
         )
 

@@ -1,5 +1,6 @@
 """The experiment on the effect of the data: its settings, the episodes of an arm, training and results."""
 
+import json
 import subprocess
 import sys
 from collections import Counter
@@ -25,12 +26,14 @@ from states import relative_by_episode
 from told import every_told, find_tasks, goals_in
 
 from pipeline.__main__ import main
+from pipeline.axes import to_json
 from pipeline.axes.goal import held_out
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment
+from pipeline.evaluation.own_draws import PlannedDraws, draw
 from pipeline.evaluation.tasks import goal_task
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
 from pipeline.libero.tasks import STEP_LIMITS, find_task
@@ -48,7 +51,13 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
-    assert further.keys() == {"pre_norm", "no_state", "starts", "goals", "goals_many"}
+    assert further.keys() == {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes"}
+    axes = further.pop("axes")
+    assert (axes.policy, axes.training) == (further["no_state"].policy, further["no_state"].training)
+    same = {"plan": {"episodes", "reserve", "axes"}}
+    assert axes.run.model_dump(exclude=same) == shipped.run.model_dump(exclude=same)
+    assert axes.run.plan.axes.layout == shipped.run.plan.axes.layout
+    assert [sum(axes.run.plan.episodes[name] for name in names) for names in axes.arms.values()] == [0, *[212] * 3]
     goals, many = further.pop("goals"), further.pop("goals_many")
     assert many == goals.model_copy(update={"data": many.data, "arms": many.arms, "decisions": many.decisions})
     same = {"plan": {"episodes"}}
@@ -108,6 +117,32 @@ def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> N
     held = {(scene.name, task.instruction) for task, scene in held_out("libero_object")}
     assert {(task.base, goal_task(task)[0].instruction) for task in goals} == held
     assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(evaluation.tellings(experiment))
+
+
+def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipped: Experiment) -> None:
+    """Textures, categories of objects and lights are compared by their names and numbers."""
+    experiment = read(EFFECT / "further" / "axes.yaml")
+    demos, trained = demonstrations(experiment, 86), []
+    for arm in experiment.arms:
+        _, chosen = episodes.planned(experiment, arm, demos)
+        trained += [row for row in chosen if row.wanted and row.role == "perturbed"]
+    textures: set[str] = set()
+    objects: set[str] = set()
+    for row in trained:
+        for perturbation in json.loads(row.perturbations):
+            textures |= {covering["texture"] for covering in perturbation.get("coverings", ())}
+            objects |= {added["category"] for added in perturbation.get("objects", ())}
+    planned = PlannedDraws(trained)
+    tests = evaluation.held_out_tests(experiment, planned)
+    assert Counter((test.base, test.axis) for test in tests) == {
+        (task.partition("/")[2], axis): 6 for task in experiment.tasks for axis in ("light", "background", "layout")
+    }
+    for test in tests:
+        task = find_task(test.suite, test.base)
+        drawn = next(one for one in (draw(test, 0, attempt) for attempt in range(20)) if not planned.overlap(one, task))
+        content = json.loads(to_json([drawn]))[0]
+        assert textures.isdisjoint(covering["texture"] for covering in content.get("coverings", ()))
+        assert objects.isdisjoint(added["category"] for added in content.get("objects", ()))
 
 
 def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:

@@ -48,6 +48,7 @@ def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
     reading = [told_row("stove", kind, asked, reached) for kind, asked, reached in told]
     settings = {
         "arms": {"clean": [], "ours": ["robot"]},
+        "evaluation": {},
         "run": {"demos": {"tasks": ["libero_goal/stove", "libero_goal/put_the_bowl_on_the_plate"]}},
     }
     black = [{"task": "stove", "state": number, "success": number < solved // 4} for number in range(10)]
@@ -85,6 +86,16 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     assert "| nothing | stove 2 of 2 | stove 2 of 2 |" in text
 
 
+def test_camera_and_noise_have_lines_of_their_own_next_to_held_out_perturbations() -> None:
+    policy = of_policy("ours", 0, 4)
+    light = row("light", 0, True, "ours0")
+    with_light = replace(policy, settings=policy.settings | {"evaluation": {"held_out": {"light": 1}}})
+    text = comparison.markdown([replace(with_light, rows=[*policy.rows, light])])
+    for line in ("| camera | 10 | 40 % |", "| noise | 10 | 40 % |", "| light, held out | 1 | 100 % |"):
+        assert line in text
+    assert "| camera, noise |" not in text
+
+
 def test_reached_goals_of_several_scenes_are_counted_by_kind() -> None:
     """In the BDDL files, the butter's scene has the tomato sauce at its own place, and the barbecue sauce elsewhere."""
     told = [
@@ -94,7 +105,7 @@ def test_reached_goals_of_several_scenes_are_counted_by_kind() -> None:
         *((BUTTER, "nothing", None, BUTTER), (BUTTER, "nothing", None, BBQ)),
     ]
     demos = {"tasks": [f"libero_object/{task}" for task in (BUTTER, BBQ, ORANGE, TOMATO)]}
-    settings = {"arms": {"ours": []}, "run": {"demos": demos}}
+    settings = {"arms": {"ours": []}, "evaluation": {}, "run": {"demos": demos}}
     reading = [told_row(*row) for row in told]
     results = [replace(of_policy("ours", seed, 9), settings=settings, reading=reading) for seed in (0, 1)]
     text = comparison.markdown(results)
@@ -109,7 +120,8 @@ def test_reached_goals_of_several_scenes_are_counted_by_kind() -> None:
 def test_held_out_goals_have_a_line_for_each_kind_of_place() -> None:
     task = EvaluationTask("goals", "libero_object", BUTTER, "name", "goal", "bbq_sauce", 0, 0)
     for asked, line in ((BBQ, "goal"), (TOMATO, "goal, own place")):
-        assert comparison.line_of(result(task, instruction=asked.replace("_", " "))) == line
+        row_of_goal = result(task, instruction=asked.replace("_", " "))
+        assert comparison.line_of(of_policy("ours", 0, 9), row_of_goal) == line
 
 
 def test_wrong_things_stand_at_the_place_that_the_instruction_had_in_training() -> None:
