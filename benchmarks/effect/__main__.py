@@ -146,9 +146,9 @@ class Work:
         for arm in self.experiment.arms:
             self.make_data(arm)
             rows += episodes.trained_on(self.dataset(arm))
-        demos = self.experiment.run.model_dump(mode="json", include={"demos"}, exclude_defaults=True)
+        sections = self.experiment.run.model_dump(mode="json", include={"demos", "plan"}, exclude_defaults=True)
         trained = Trained(folder / "trained.yaml", folder / "trained" / "plan.parquet")
-        write(trained.file, yaml.safe_dump({"name": "trained", "folder": str(folder), **demos}))
+        write(trained.file, yaml.safe_dump({"name": "trained", "folder": str(folder), **sections}))
         plan.write(rows, trained.plan_file)
         return trained
 

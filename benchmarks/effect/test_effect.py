@@ -269,7 +269,7 @@ def small(folder: Path, demos: Path) -> Path:
             **{"n_encoder_layers": 1, "use_vae": False, "dropout": 0.0},
         },
         "training": {"steps": 4, "batch_size": 2, "learning_rate": 1e-3, "save_every": 2, "proprioception": "relative"},
-        "evaluation": {"states": 1, "libero_plus": {}, "reading_states": 1},
+        "evaluation": {"states": 1, "libero_plus": {}, "held_out": {"light": 1}, "reading_states": 1},
     }
     file = folder / "experiment.yaml"
     file.write_text(yaml.safe_dump(settings))
@@ -395,8 +395,9 @@ def test_from_demonstrations_to_the_results(
     monkeypatch.setattr(sys, "argv", words)
     command.main()
     (found,) = results.read(kept)
-    (row,) = found.rows
-    assert (row.source, row.axis, row.reason, row.steps, row.looks) == ("libero", "clean", "step_limit", 50, 2)
+    outcomes = [(row.source, row.axis, row.reason, row.steps, row.looks) for row in found.rows]
+    assert outcomes == [("libero", "clean", "step_limit", 50, 2), ("own", "light", "step_limit", 50, 2)]
+    assert ("plan" in found.rows[0].settings, "plan" in found.rows[1].settings) == (False, True)
     assert [(one["state"], one["instruction"], one["reached"], one["steps"]) for one in found.reading] == [
         (49, "turn on the stove", None, 50),
         (49, "", None, 50),
