@@ -120,7 +120,7 @@ class Work:
                 trained = self._trained(folder)
                 held_out = evaluation.held_out_tests(self.experiment, own_draws.planned(trained.plan_file))
                 rows += run_tests(held_out, folder / "held_out", *server, "--trained-on", str(trained.file))
-            reading = evaluation.tell(self.experiment, address, folder / "reading")
+            reading = evaluation.obedience(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)
         losses = (policy / "training.jsonl").read_text().splitlines()
         made: dict[str, Any] = {

@@ -6,8 +6,8 @@ from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
 
+from instructions import at_own_place
 from results import PolicyResults, read
-from told import at_own_place
 
 from pipeline.evaluation.results import EpisodeResult, Trial
 from pipeline.evaluation.statistics import Pair, compare, paired, success_rate, wilson
@@ -144,7 +144,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def reading(results: Sequence[PolicyResults], arm: str) -> dict[str, Counter[str | None]]:
     """Count the reached goals of each instruction, over all seeds."""
     counts: dict[str, Counter[str | None]] = defaultdict(Counter)
-    for row in _told(results, arm):
+    for row in _readings(results, arm):
         counts[row["instruction"]][row["reached"]] += 1
     return dict(counts)
 
@@ -156,7 +156,7 @@ def reading_by_kind(results: Sequence[PolicyResults], arm: str) -> dict[str, Cou
     """
     counts: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
     (suite,) = {name.partition("/")[0] for name in results[0].settings["run"]["demos"]["tasks"]}
-    for row in _told(results, arm):
+    for row in _readings(results, arm):
         outcomes = {None: "none", row["scene"]: "usual"}
         kind = row["kind"]
         if row["asked"]:
@@ -167,7 +167,7 @@ def reading_by_kind(results: Sequence[PolicyResults], arm: str) -> dict[str, Cou
     return counts
 
 
-def _told(results: Sequence[PolicyResults], arm: str) -> Iterator[dict[str, Any]]:
+def _readings(results: Sequence[PolicyResults], arm: str) -> Iterator[dict[str, Any]]:
     for policy in results:
         if policy.arm == arm:
             yield from policy.reading
@@ -224,7 +224,7 @@ def _reading_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     arms = arms_of(results)
     names = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
     reached = {arm: reading(results, arm) for arm in arms}
-    rows = [["told", *arms]]
+    rows = [["instruction", *arms]]
     for instruction in reached[arms[0]]:
         cells = [_reached(counts[instruction], instruction, names) for counts in reached.values()]
         rows.append([instruction or "nothing", *cells])
@@ -233,7 +233,7 @@ def _reading_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
 
 def _kind_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     """Return the counts of reached goals by kind of instruction, arm and outcome."""
-    rows = [["told", "arm", "asked", "the scene's usual", "another", "none"]]
+    rows = [["instruction", "arm", "asked", "the scene's usual", "another", "none"]]
     for kind, words in KINDS.items():
         for arm in arms_of(results):
             counts = reading_by_kind(results, arm)[kind]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from experiment import Experiment
-from told import Told, every_told, find_tasks, goals_in
+from instructions import Instruction, every_instruction, find_tasks, goals_in
 
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
@@ -76,34 +76,35 @@ def held_out_tests(experiment: Experiment, trained: PlannedDraws) -> list[Evalua
 def _held_out_goals(tasks: Sequence[Task], states: int) -> list[EvaluationTask]:
     """Select the goals that no plan carries to the scenes of the experiment."""
     asked: set[Hashable] = set()
-    for told in every_told(tasks):
-        if told.asked and told.kind == "held out":
-            asked.add(definition_of(carried(told.asked, told.scene)).asked)
+    for instruction in every_instruction(tasks):
+        if instruction.asked and instruction.kind == "held out":
+            asked.add(definition_of(carried(instruction.asked, instruction.scene)).asked)
     suites = tuple(dict.fromkeys(task.suite for task in tasks))
     goals = select(Selection(source="goals", suites=suites, episodes=states))
     return [goal for goal in goals if goal_task(goal)[1] in asked]
 
 
 @dataclass(frozen=True)
-class Telling:
+class InstructedEpisode:
     """Episode in which a policy gets an instruction from one of the scene's initial states."""
 
-    told: Told
+    instruction: Instruction
     state: int
 
     @property
     def file(self) -> str:
-        asked = self.told.asked.name if self.told.asked else "nothing"
-        return f"{self.told.scene.name}_{self.state}_{asked}.json"
+        asked = self.instruction.asked.name if self.instruction.asked else "nothing"
+        return f"{self.instruction.scene.name}_{self.state}_{asked}.json"
 
 
-def tellings(experiment: Experiment) -> list[Telling]:
+def instructed_episodes(experiment: Experiment) -> list[InstructedEpisode]:
     """Combine each scene's instructions with its last initial states."""
+    instructions = every_instruction(find_tasks(experiment.tasks))
     states = range(INITIAL_STATES - experiment.evaluation.reading_states, INITIAL_STATES)
-    return [Telling(told, state) for told, state in product(every_told(find_tasks(experiment.tasks)), states)]
+    return [InstructedEpisode(instruction, state) for instruction, state in product(instructions, states)]
 
 
-def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:
+def obedience(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:
     """Run the episodes without results in the folder.
 
     Args:
@@ -112,30 +113,30 @@ def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, A
         folder: folder of the results.
 
     Returns:
-        A row for each episode: ``scene`` (name of its task), ``kind`` and ``instruction`` as in ``Told``, ``asked``
-        and ``reached`` (names of tasks, or ``None``), ``state``, ``steps``.
+        A row for each episode: ``scene`` (name of its task), ``kind`` as in ``Instruction``, ``instruction`` (the text),
+        ``asked`` and ``reached`` (names of tasks, or ``None``), ``state``, ``steps``.
     """
-    wanted = tellings(experiment)
-    missing = [telling for telling in wanted if not (folder / telling.file).exists()]
+    wanted = instructed_episodes(experiment)
+    missing = [episode for episode in wanted if not (folder / episode.file).exists()]
     if missing:
         with runner(ComputeConfig(), folder, renders=True) as workers:
-            job = partial(_tell, find_tasks(experiment.tasks), address, folder)
+            job = partial(_run_instructed, find_tasks(experiment.tasks), address, folder)
             workers(job, [missing[::2], missing[1::2]], "reading, halves")
-    return [read_json(folder / telling.file) for telling in wanted]
+    return [read_json(folder / episode.file) for episode in wanted]
 
 
-def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Telling]) -> None:
+def _run_instructed(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[InstructedEpisode]) -> None:
     environment, policy = EpisodeEnvironment(), Server(address)
-    for telling in wanted:
-        told = telling.told
-        goals = goals_in(told.scene, tasks)
-        episode = libero_task(told.scene, telling.state)
+    for instructed in wanted:
+        instruction = instructed.instruction
+        goals = goals_in(instruction.scene, tasks)
+        episode = libero_task(instruction.scene, instructed.state)
         progress = environment.reset(episode)
         policy.begin(episode)
         reached: list[str] = []
 
-        def look(wanted: Wanted, instruction: str = told.instruction) -> dict[str, Any]:
-            return environment.observation(wanted) | {"task_description": instruction}
+        def look(wanted: Wanted, text: str = instruction.text) -> dict[str, Any]:
+            return environment.observation(wanted) | {"task_description": text}
 
         while not (progress.over or reached):
             for action in policy.act(look):
@@ -145,14 +146,14 @@ def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Te
                     break
         policy.end(progress.success)
         row = {
-            "scene": told.scene.name,
-            "kind": told.kind,
-            "asked": told.asked.name if told.asked else None,
-            "state": telling.state,
-            "instruction": told.instruction,
+            "scene": instruction.scene.name,
+            "kind": instruction.kind,
+            "asked": instruction.asked.name if instruction.asked else None,
+            "state": instructed.state,
+            "instruction": instruction.text,
             "reached": next(iter(reached), None),
             "steps": progress.steps,
         }
-        write_json(folder / telling.file, row)
+        write_json(folder / instructed.file, row)
     policy.close()
     environment.close()

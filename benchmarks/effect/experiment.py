@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+from instructions import every_instruction, find_tasks
 from pydantic import Field, ValidationError, field_validator, model_validator
-from told import every_told, find_tasks
 
 from pipeline.axes import axes_of
 from pipeline.axes.base import Frozen
@@ -67,8 +67,8 @@ class EvaluationConfig(Frozen):
 
     def episodes(self, names: Sequence[str]) -> int:
         """Return the number of episodes of the tasks with these names, without those with black views."""
-        instructions = every_told(find_tasks(names))
-        goals = sum(told.kind == "held out" for told in instructions)
+        instructions = every_instruction(find_tasks(names))
+        goals = sum(instruction.kind == "held out" for instruction in instructions)
         return (
             len(names) * (self.states + sum(self.libero_plus.values()) + sum(self.held_out.values()))
             + goals * self.held_out_goals

@@ -21,7 +21,7 @@ class PolicyResults:
         settings: settings of the experiment, and the tasks.
         made: hashes of data, sentences and policy, axes of the episodes, losses, packages, and times of the steps.
         rows: episodes of test tasks.
-        reading: rows of ``evaluation.tell``.
+        reading: rows of ``evaluation.obedience``.
         black: ``task``, ``state`` and ``success`` from LIBERO's own states with both views black.
     """
 

@@ -22,8 +22,8 @@ import sentences
 import yaml
 from conftest import REPOSITORY, STOVE, link_testset, memory, once, short_demos, tiny_config, whole  # noqa: F401
 from experiment import Experiment, read
+from instructions import every_instruction, find_tasks, goals_in
 from states import relative_by_episode
-from told import every_told, find_tasks, goals_in
 
 from pipeline.__main__ import main
 from pipeline.axes import to_json
@@ -95,9 +95,12 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
 
 def test_a_scene_has_the_instructions_that_mean_something_there(shipped: Experiment) -> None:
     """Counts by the table of pairs in docs/axes.md; the goals of one scene were read in its BDDL file."""
-    assert [told.kind for told in every_told(find_tasks(shipped.tasks))] == [*["own"] * 4, "nothing"]
+    assert [instruction.kind for instruction in every_instruction(find_tasks(shipped.tasks))] == [
+        *["own"] * 4,
+        "nothing",
+    ]
     tasks = find_tasks(read(EFFECT / "further" / "goals.yaml").tasks)
-    kinds = Counter(told.kind for told in every_told(tasks))
+    kinds = Counter(instruction.kind for instruction in every_instruction(tasks))
     assert kinds == {"own": 10, "carried": 40, "held out": 10, "nothing": 10}
     (butter,) = (task for task in tasks if "butter" in task.name)
     in_scene = {"butter", "ketchup", "bbq_sauce", "tomato_sauce", "chocolate_pudding", "orange_juice"}
@@ -116,7 +119,9 @@ def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> N
     assert {task.number for task in goals} == set(range(5))
     held = {(scene.name, task.instruction) for task, scene in held_out("libero_object")}
     assert {(task.base, goal_task(task)[0].instruction) for task in goals} == held
-    assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(evaluation.tellings(experiment))
+    assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(
+        evaluation.instructed_episodes(experiment)
+    )
 
 
 def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipped: Experiment) -> None:
@@ -190,7 +195,7 @@ def test_all_sentences_of_the_experiment_have_embeddings_that_tell_tasks_apart(s
     instructions = [find_task(*name.split("/")).instruction for name in shipped.tasks]
     own = [sentences.used([name])[2:] for name in shipped.tasks]
     nearest = [
-        int(np.argmax([vectors[text] @ vectors[told] for told in instructions])) == place
+        int(np.argmax([vectors[text] @ vectors[instruction] for instruction in instructions])) == place
         for place, texts in enumerate(own)
         for text in texts
     ]
@@ -281,13 +286,15 @@ def numbered() -> episodes.Dataset:
     """Return two episodes of three and two steps, whose actions state the number of their step."""
     draws = np.random.default_rng(0)
     action = np.repeat(np.arange(5, dtype=np.float32)[:, None], 7, axis=1)
-    told = [{"instruction": text} for text in ("turn on the stove", "put the bowl on the plate")]
+    rows = [{"instruction": text} for text in ("turn on the stove", "put the bowl on the plate")]
     images = {view: draws.integers(0, 256, (5, 32, 32, 3), np.uint8) for view in episodes.VIEWS}
-    return episodes.Dataset(images, draws.random((5, 8), np.float32), action, np.array([3, 2]), told)
+    return episodes.Dataset(images, draws.random((5, 8), np.float32), action, np.array([3, 2]), rows)
 
 
 @pytest.mark.slow
-def test_a_batch_has_the_actions_that_follow_and_what_was_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_has_the_actions_that_follow_and_what_was_readings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from training import ACTION, SENTENCE, Steps
 
     monkeypatch.chdir(tmp_path)
@@ -295,12 +302,14 @@ def test_a_batch_has_the_actions_that_follow_and_what_was_told(tmp_path: Path, m
     batch = Steps(read(small(tmp_path, tmp_path / "demos")), numbered(), vectors).batch(np.random.default_rng(0), 50)
     first = batch[ACTION][:, 0, 0]
     assert set(first.tolist()) == {0, 1, 2, 3, 4}
-    for number, actions, pad, told in zip(first, batch[ACTION], batch["action_is_pad"], batch[SENTENCE], strict=True):
+    for number, actions, pad, sentence in zip(
+        first, batch[ACTION], batch["action_is_pad"], batch[SENTENCE], strict=True
+    ):
         end = 3 if number < 3 else 5
         text = "turn on the stove" if number < 3 else "put the bowl on the plate"
         assert actions[:, 0].tolist() == [min(number + step, end - 1) for step in range(100)]
         assert pad.tolist() == [number + step >= end for step in range(100)]
-        assert told.tolist() == vectors[text].tolist()
+        assert sentence.tolist() == vectors[text].tolist()
 
 
 def test_relative_states_do_not_depend_on_the_place_of_the_episode() -> None:

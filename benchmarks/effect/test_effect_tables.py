@@ -33,7 +33,7 @@ def row(axis: str, number: int, success: bool, policy: str) -> EpisodeResult:
     return result(task, success, policy)
 
 
-def told_row(scene: str, kind: str, asked: str | None, reached: str | None) -> dict[str, Any]:
+def reading_row(scene: str, kind: str, asked: str | None, reached: str | None) -> dict[str, Any]:
     text = (asked or "").replace("_", " ")
     return {
         **{"scene": scene, "kind": kind, "asked": asked, "state": 0},
@@ -44,8 +44,8 @@ def told_row(scene: str, kind: str, asked: str | None, reached: str | None) -> d
 def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
     """Return results: of each axis the first ``solved`` of ten tasks, and one of two instructions, are solved."""
     rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in AXES for number in range(10)]
-    told = [("own", "stove", "stove"), ("own", "put_the_bowl_on_the_plate", "stove"), ("nothing", None, "stove")]
-    reading = [told_row("stove", kind, asked, reached) for kind, asked, reached in told]
+    outcomes = [("own", "stove", "stove"), ("own", "put_the_bowl_on_the_plate", "stove"), ("nothing", None, "stove")]
+    reading = [reading_row("stove", kind, asked, reached) for kind, asked, reached in outcomes]
     settings = {
         "arms": {"clean": [], "ours": ["robot"]},
         "evaluation": {},
@@ -98,7 +98,7 @@ def test_camera_and_noise_have_lines_of_their_own_next_to_held_out_perturbations
 
 def test_reached_goals_of_several_scenes_are_counted_by_kind() -> None:
     """In the BDDL files, the butter's scene has the tomato sauce at its own place, and the barbecue sauce elsewhere."""
-    told = [
+    outcomes = [
         *((BUTTER, "own", BUTTER, BUTTER), (BUTTER, "own", BUTTER, BBQ), (ORANGE, "own", ORANGE, None)),
         *((BUTTER, "held out", BBQ, BUTTER), (BUTTER, "held out", BBQ, BBQ), (ORANGE, "held out", BUTTER, BUTTER)),
         *((BUTTER, "carried", TOMATO, BUTTER), (BUTTER, "carried", ORANGE, TOMATO)),
@@ -106,7 +106,7 @@ def test_reached_goals_of_several_scenes_are_counted_by_kind() -> None:
     ]
     demos = {"tasks": [f"libero_object/{task}" for task in (BUTTER, BBQ, ORANGE, TOMATO)]}
     settings = {"arms": {"ours": []}, "evaluation": {}, "run": {"demos": demos}}
-    reading = [told_row(*row) for row in told]
+    reading = [reading_row(*row) for row in outcomes]
     results = [replace(of_policy("ours", seed, 9), settings=settings, reading=reading) for seed in (0, 1)]
     text = comparison.markdown(results)
     assert "| the scene's own instruction | ours | 2 | - | 2 of 6 | 2 of 6 |" in text

@@ -23,7 +23,7 @@ plan carries there, or the empty instruction."""
 
 
 @dataclass(frozen=True)
-class Told:
+class Instruction:
     """An instruction in a scene.
 
     Attributes:
@@ -37,7 +37,7 @@ class Told:
     kind: Kind
 
     @property
-    def instruction(self) -> str:
+    def text(self) -> str:
         return self.asked.instruction if self.asked else ""
 
 
@@ -54,22 +54,22 @@ def scenes_of(tasks: Sequence[Task]) -> list[Task]:
     return list(first.values())
 
 
-def told_in(scene: Task, tasks: Sequence[Task]) -> list[Told]:
+def instructions_in(scene: Task, tasks: Sequence[Task]) -> list[Instruction]:
     """List the instructions in a scene: of the tasks that begin there, of tasks that can be carried there, and none."""
     place = bddl.read(scene.bddl_file).scene
-    listed = [Told(scene, task, "own") for task in tasks if bddl.read(task.bddl_file).scene == place]
+    listed = [Instruction(scene, task, "own") for task in tasks if bddl.read(task.bddl_file).scene == place]
     for pair in usable(scene.suite):
         if pair.task in tasks and bddl.read(pair.scene.bddl_file).scene == place:
             held = (pair.task, pair.scene) in held_out(scene.suite)
-            listed.append(Told(scene, pair.task, "held out" if held else "carried"))
-    return [*listed, Told(scene, None, "nothing")]
+            listed.append(Instruction(scene, pair.task, "held out" if held else "carried"))
+    return [*listed, Instruction(scene, None, "nothing")]
 
 
-def every_told(tasks: Sequence[Task]) -> list[Told]:
+def every_instruction(tasks: Sequence[Task]) -> list[Instruction]:
     """List the instructions of all scenes."""
-    listed: list[Told] = []
+    listed: list[Instruction] = []
     for scene in scenes_of(tasks):
-        listed += told_in(scene, tasks)
+        listed += instructions_in(scene, tasks)
     return listed
 
 
@@ -93,8 +93,8 @@ def at_own_place(suite: str, scene: str, asked: str) -> bool:
 def goals_in(scene: Task, tasks: Sequence[Task]) -> dict[str, tuple[Fact, ...]]:
     """Return the name of each task in a scene and its goal there."""
     goals: dict[str, tuple[Fact, ...]] = {}
-    for told in told_in(scene, tasks):
-        if told.asked:
-            played = told.asked if told.kind == "own" else carried(told.asked, scene)
-            goals[told.asked.name] = definition_of(played).goal
+    for instruction in instructions_in(scene, tasks):
+        if instruction.asked:
+            played = instruction.asked if instruction.kind == "own" else carried(instruction.asked, scene)
+            goals[instruction.asked.name] = definition_of(played).goal
     return goals
