@@ -113,7 +113,7 @@ def obedience(experiment: Experiment, address: str, folder: Path) -> list[dict[s
         folder: folder of the results.
 
     Returns:
-        A row for each episode: ``scene`` (name of its task), ``kind`` as in ``Instruction``, ``instruction`` (the text),
+        A row for each episode: ``scene`` (name of its task), ``kind`` as in ``Instruction``, ``instruction`` (text),
         ``asked`` and ``reached`` (names of tasks, or ``None``), ``state``, ``steps``.
     """
     wanted = instructed_episodes(experiment)

@@ -95,10 +95,8 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
 
 def test_a_scene_has_the_instructions_that_mean_something_there(shipped: Experiment) -> None:
     """Counts by the table of pairs in docs/axes.md; the goals of one scene were read in its BDDL file."""
-    assert [instruction.kind for instruction in every_instruction(find_tasks(shipped.tasks))] == [
-        *["own"] * 4,
-        "nothing",
-    ]
+    kinds_of_shipped = [instruction.kind for instruction in every_instruction(find_tasks(shipped.tasks))]
+    assert kinds_of_shipped == [*["own"] * 4, "nothing"]
     tasks = find_tasks(read(EFFECT / "further" / "goals.yaml").tasks)
     kinds = Counter(instruction.kind for instruction in every_instruction(tasks))
     assert kinds == {"own": 10, "carried": 40, "held out": 10, "nothing": 10}
@@ -119,9 +117,8 @@ def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> N
     assert {task.number for task in goals} == set(range(5))
     held = {(scene.name, task.instruction) for task, scene in held_out("libero_object")}
     assert {(task.base, goal_task(task)[0].instruction) for task in goals} == held
-    assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(
-        evaluation.instructed_episodes(experiment)
-    )
+    instructed = evaluation.instructed_episodes(experiment)
+    assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(instructed)
 
 
 def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipped: Experiment) -> None:
@@ -292,7 +289,7 @@ def numbered() -> episodes.Dataset:
 
 
 @pytest.mark.slow
-def test_a_batch_has_the_actions_that_follow_and_what_was_readings(
+def test_a_batch_has_the_actions_that_follow_and_the_instruction(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from training import ACTION, SENTENCE, Steps
