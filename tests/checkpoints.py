@@ -9,23 +9,26 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+from lerobot.processor.rename_processor import RenameObservationsProcessorStep
 from safetensors.torch import load_file, save_file
 
 CHUNK = 2
+IMAGE = "observation.images.image"
 BIAS = "model.action_head.bias"
 
 
-def save(folder: Path, action: float, scale: float = 1.0) -> Path:
+def save(folder: Path, action: float, scale: float = 1.0, image: str = IMAGE) -> Path:
     """Save an ACT policy whose every action is ``action`` times ``scale`` in all seven numbers, taken two at a time.
 
     Args:
         folder: folder of the policy.
         action: output of the network: all of its weights are zero except the last bias.
         scale: factor of the processor after the network.
+        image: key of the policy's image. Another key than ``IMAGE`` was renamed by ``--rename_map`` in its training.
     """
     config = ACTConfig(
         input_features={
-            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+            image: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
             "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
@@ -39,10 +42,15 @@ def save(folder: Path, action: float, scale: float = 1.0) -> Path:
         for weights in policy.parameters():
             weights.zero_()
         policy.get_parameter(BIAS).fill_(action)
-    sizes = {"observation.images.image": (3, 1, 1), "observation.state": (8,), "action": (7,)}
+    sizes = {image: (3, 1, 1), "observation.state": (8,), "action": (7,)}
     stats = {name: {"mean": torch.zeros(size), "std": torch.ones(size)} for name, size in sizes.items()}
     stats["action"]["std"] *= scale
-    for part in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    if image != IMAGE:
+        # As lerobot-train sets it; make_pre_post_processors takes it for saved processors only.
+        (step,) = (step for step in before.steps if isinstance(step, RenameObservationsProcessorStep))
+        step.rename_map = {IMAGE: image}
+    for part in (policy, before, after):
         part.save_pretrained(folder)
     return folder
 

@@ -61,6 +61,7 @@ TRAINED_ON = "Configuration of the policy's training data; held-out perturbation
     black="--black",
     initial_states="--initial-states",
     look_every="--look-every",
+    state_angle="--state-angle",
     actions="--actions",
     own_step_limit="--own-step-limit",
 )

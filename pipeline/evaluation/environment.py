@@ -16,7 +16,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import libero_plus, own_draws
 from pipeline.evaluation.actions import Actions, checked_actions
-from pipeline.evaluation.policies import VIEWS, Wanted
+from pipeline.evaluation.policies import VIEWS, StateAngle, Wanted
 from pipeline.evaluation.recordings import demonstration
 from pipeline.evaluation.results import REFUSED
 from pipeline.evaluation.simulator import Picture, Simulator
@@ -57,6 +57,10 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
     """number of control steps between two observations of a server that keeps its chunks: the number of actions that
     the server takes from each chunk"""
+    state_angle: StateAngle = Field(default="server", exclude_if=lambda angle: angle == "server")
+    """range of the angle of the state's axis-angle: ``server`` as the server requests, ``pi`` [0, pi] rad, ``2pi``
+    [0, 2 pi] rad as in LIBERO, robosuite and these datasets. vla-eval's servers for lerobot and pi0 cannot request
+    ``2pi``"""
     step_limits: Literal["openvla", "lerobot"] = Field(default="openvla", exclude_if=lambda limits: limits == "openvla")
     """source of the step limits: they differ in libero_spatial, 220 (openvla) and 280 (lerobot)"""
     own_step_limit: int | None = Field(default=None, ge=1, exclude_if=lambda limit: limit is None)

@@ -19,7 +19,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws, recordings
 from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.policies import Policy, warn_of_single_view
+from pipeline.evaluation.policies import Policy, warn_of_requests
 from pipeline.evaluation.results import one_setting
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
 from pipeline.evaluation.selection import Selection, select
@@ -66,6 +66,8 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         raise PipelineError(
             f"only a server can observe every {settings.look_every} steps", where="look_every", expected="--server"
         )
+    if settings.state_angle != "server" and policy.kind != "server":
+        raise PipelineError("only a server has another range of angles", where="state_angle", expected="--server")
     if settings.actions == "absolute" and policy.kind in ("open_loop", "tracked"):
         raise PipelineError(
             "the replays of demonstrations execute deltas", where="actions", expected="--server or --checkpoint"
@@ -78,7 +80,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     if missing:
         if policy.kind == "server":
             # Each worker connects for itself. This connection warns once, before the workers start.
-            warn_of_single_view(policy.address, policy.timeout_s, settings.actions)
+            warn_of_requests(policy.address, policy.timeout_s, settings.actions, settings.state_angle)
         device = gl.choose().device
         jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _jobs(missing, workers)]
         work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)
@@ -318,7 +320,7 @@ def _policy(policy_config: PolicyConfig, identity: str, settings: EpisodeSetting
     Raises:
         PipelineError: if it is not the policy with which the evaluation began.
     """
-    policy = policy_config.open(settings.look_every, settings.actions, settings.demos)
+    policy = policy_config.open(settings)
     # The identity is computed after loading: files that changed before they were loaded still differ now.
     if policy_config.identity() != identity:
         raise PipelineError(

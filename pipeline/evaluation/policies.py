@@ -2,10 +2,10 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,6 +20,10 @@ from pipeline.types import Floats
 
 VIEWS = {"agentview": "image", "wrist": "wrist_image"}
 """Name of a view for policies to its name in ``schemas/episode.json``."""
+
+
+StateAngle = Literal["server", "pi", "2pi"]
+"""Range of the angle of a state's axis-angle, in rad: as the server requests, [0, pi], or [0, 2 pi]."""
 
 
 class Wanted(NamedTuple):
@@ -103,6 +107,7 @@ class Server:
         address: address of the server, such as ``ws://localhost:8000``.
         timeout_s: time limit of an answer.
         look_every: number of control steps between two observations, see ``NextLook``.
+        state_angle: range of the angle of the state's axis-angle, in place of the range that the server requests.
 
     Attributes:
         states_request: the server announces one of ``REQUESTS``, also if its value is false.
@@ -111,7 +116,14 @@ class Server:
         PipelineError: if no server answers at the address, or if its actions cannot be executed.
     """
 
-    def __init__(self, address: str, timeout_s: float = 120.0, look_every: int = 1, actions: Actions = "delta"):
+    def __init__(
+        self,
+        address: str,
+        timeout_s: float = 120.0,
+        look_every: int = 1,
+        actions: Actions = "delta",
+        state_angle: StateAngle = "server",
+    ):
         try:
             from vla_eval.connection import Connection
         except ImportError as error:
@@ -119,6 +131,7 @@ class Server:
                 "the package vla-eval is not installed", remedy="pip install vla-eval==0.8.0"
             ) from error
         self.name, self._next_look, self._actions = address, NextLook(look_every), actions
+        self._state_angle = state_angle
         self._loop = asyncio.new_event_loop()
         self._connection = Connection(address, timeout=timeout_s, max_retries=3)
         self._connect()
@@ -185,9 +198,8 @@ class Server:
         except PipelineError:
             self.close()
             raise
-        self.wanted = Wanted(
-            bool(wanted.get("send_wrist_image")), bool(wanted.get("send_state")), not wanted.get("quat_no_antipodal")
-        )
+        shortest = not wanted.get("quat_no_antipodal") if self._state_angle == "server" else self._state_angle == "pi"
+        self.wanted = Wanted(bool(wanted.get("send_wrist_image")), bool(wanted.get("send_state")), shortest)
 
     def _run(self, awaited: Any, limit_s: float | None = None) -> Any:
         """Wait for a reply of the connection.
@@ -212,18 +224,28 @@ class Server:
         return PolicyError(what, where=self.name, remedy="read the server's log")
 
 
-def warn_of_single_view(address: str, timeout_s: float, actions: Actions) -> None:
-    """Log a warning if a server announces none of ``REQUESTS``, because its author may have forgotten it.
+def warn_of_requests(address: str, timeout_s: float, actions: Actions, state_angle: StateAngle) -> None:
+    """Log a warning if a server gets an observation that its author may not have meant.
+
+    It may announce none of ``REQUESTS``, or get the state with angles in [0, pi] without a decision of the user.
 
     Args:
         address: address of the server, such as ``ws://localhost:8000``.
         timeout_s: time limit of an answer.
         actions: the actions that the evaluation executes.
+        state_angle: as ``Server``.
 
     Raises:
         PipelineError: as ``Server``.
     """
-    with closing(Server(address, timeout_s, actions=actions)) as server:
+    with closing(Server(address, timeout_s, actions=actions, state_angle=state_angle)) as server:
+        if server.wanted.state and server.wanted.shortest_rotation and state_angle == "server":
+            logging.getLogger(__name__).warning(
+                "%s gets the state with angles in [0, pi], as it does not request quat_no_antipodal. A policy that was "
+                "trained on these datasets or on LIBERO's states needs --state-angle 2pi. --state-angle pi silences "
+                "this warning (docs/model-server.md)",
+                address,
+            )
         if not server.states_request:
             logging.getLogger(__name__).warning(
                 "%s announces neither %s: its policy receives only the agent view and the instruction. If the policy "
@@ -232,6 +254,59 @@ def warn_of_single_view(address: str, timeout_s: float, actions: Actions) -> Non
                 address,
                 " nor ".join(REQUESTS),
             )
+
+
+class Camera(NamedTuple):
+    """Image that a checkpoint gets.
+
+    Attributes:
+        view: name of the view for policies, see ``VIEWS``.
+        size_px: height and width of the frames that the policy was trained on.
+    """
+
+    view: str
+    size_px: tuple[int, int]
+
+
+def cameras_of(config: Any, renamed: Mapping[str, str], folder: Path) -> dict[str, Camera]:
+    """Map the key of each image that a policy gets, as in the datasets, to its camera.
+
+    A policy with ``empty_cameras``, such as SmolVLA and pi0.5, acts without some of its images.
+
+    Args:
+        config: lerobot's configuration of the policy.
+        renamed: key of the datasets to the policy's own key, as the policy's processor renames observations.
+        folder: folder of the policy, for error messages.
+
+    Raises:
+        PipelineError: if the policy needs an image that the tasks do not have.
+    """
+    wanted, cameras = dict(config.image_features), {}
+    offered = {SCHEMA.views[view].lerobot_key: name for name, view in VIEWS.items()}
+    for key, view in offered.items():
+        feature = wanted.pop(renamed.get(key, key), None)
+        if feature is not None:
+            _, height, width = feature.shape
+            cameras[key] = Camera(view, (height, width))
+    if wanted and not (cameras and hasattr(config, "empty_cameras")):
+        raise PipelineError(
+            f"the policy needs the images {', '.join(wanted)}, which the tasks do not have",
+            where=folder,
+            expected=", ".join(offered),
+            remedy="train with lerobot's --rename_map, which the checkpoint keeps",
+        )
+    return cameras
+
+
+def _renamed(processor: Any) -> dict[str, str]:
+    """Return the keys of observations that a policy's processor renames, and their new names."""
+    from lerobot.processor.rename_processor import RenameObservationsProcessorStep
+
+    renamed: dict[str, str] = {}
+    for step in processor.steps:
+        if isinstance(step, RenameObservationsProcessorStep):
+            renamed |= step.rename_map
+    return renamed
 
 
 class Checkpoint:
@@ -266,16 +341,7 @@ class Checkpoint:
         self._before, self._after = make_pre_post_processors(
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
         )
-        cameras = {SCHEMA.views[view].lerobot_key: name for name, view in VIEWS.items()}
-        unknown = ", ".join(key for key in config.image_features if key not in cameras)
-        if unknown:
-            raise PipelineError(
-                f"the policy needs the images {unknown}, which the tasks do not have",
-                where=folder,
-                expected=", ".join(cameras),
-            )
-        self._cameras = {key: name for key, name in cameras.items() if key in config.image_features}
-        self._sizes_px = {key: config.image_features[key].shape[1:] for key in self._cameras}
+        self._cameras = cameras_of(config, _renamed(self._before), folder)
         chunked = getattr(config, "n_obs_steps", 1) == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
         self._chunk = int(getattr(config, "n_action_steps", 1)) if chunked else 1
 
@@ -289,8 +355,8 @@ class Checkpoint:
         """Return the policy's actions for a new observation, (n, 7); n is 1 without chunks."""
         observation = look(self.wanted)
         batch: dict[str, Any] = {}
-        for key, name in self._cameras.items():
-            frame = resized(observation["images"][name], *self._sizes_px[key])
+        for key, camera in self._cameras.items():
+            frame = resized(observation["images"][camera.view], *camera.size_px)
             batch[key] = self._torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255
         batch["observation.state"] = self._torch.from_numpy(observation["states"])[None]
         batch["task"] = [observation["task_description"]]

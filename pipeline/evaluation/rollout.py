@@ -18,7 +18,7 @@ from pipeline.axes.base import Frozen
 from pipeline.axes.component_names import stored_names
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, own_draws, recordings
-from pipeline.evaluation.actions import Actions, checked_actions
+from pipeline.evaluation.actions import checked_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
@@ -90,21 +90,17 @@ class PolicyConfig(Frozen, use_attribute_docstrings=True):
         scripts = {"open_loop": "replay", "tracked": "tracked replay"}
         return self.label or scripts.get(self.kind) or f"{self.address} {identity.removeprefix('sha256:')[:8]}"
 
-    def open(self, look_every: int, actions: Actions, demos: Path | None = None) -> Policy:
-        """Load the policy, or connect to its server.
-
-        Args:
-            demos: folder of the demonstrations that a replay repeats; by default the starter set.
-        """
+    def open(self, settings: EpisodeSettings) -> Policy:
+        """Load the policy, or connect to its server."""
         match self.kind:
             case "server":
-                return Server(self.address, self.timeout_s, look_every, actions)
+                return Server(self.address, self.timeout_s, settings.look_every, settings.actions, settings.state_angle)
             case "checkpoint":
                 return Checkpoint(Path(self.address))
             case "open_loop":
-                return Replay(demos=demos)
+                return Replay(demos=settings.demos)
             case "tracked":
-                return TrackedReplay(demos)
+                return TrackedReplay(settings.demos)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """The fine-tuning recipe says what was kept, and each client finds its set and statistics by its command."""
 
+import inspect
 import json
 import runpy
 import shlex
+from importlib import import_module
 from pathlib import Path
 
 import h5py
@@ -10,9 +12,11 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+from command_words import parse
 from conftest import datasets_in
 from synthetic import IDS, SET, TASK, episode, write_hdf5, write_lerobot_v21
 from tiny_recipe import NAME, ROWS, SUITES, export_config, row, tiny_recipe
+from vla_eval.model_servers.base import ModelServer
 
 from pipeline.clients.recipe import build, write
 from pipeline.export_config import ExportConfig
@@ -155,6 +159,32 @@ def test_written_recipe_is_read_back_and_its_commands_can_be_copied(tmp_path: Pa
     text = (tmp_path / "finetune" / "finetune.yaml").read_text()
     assert yaml.safe_load(text) == recipe
     assert all(client["command"] in text for client in recipe["clients"].values())
+
+
+def test_the_evaluation_of_each_trained_policy_is_understood_by_both_programs(tmp_path: Path) -> None:
+    """vla-eval's servers have the parameters, and ``evaluate`` the options; chunks have the length of the training."""
+    export = export_config(lerobot_openpi={"name": NAME, "validation": 0.1})
+    recipe = tiny_recipe(tmp_path, export)
+    evaluated = {name: client["evaluate"] for name, client in recipe["clients"].items() if "evaluate" in client}
+    assert evaluated.keys() == {"openvla_oft", "lerobot_act", "lerobot_smolvla", "lerobot_pi05", "openpi"}
+    for commands in evaluated.values():
+        words = shlex.split(commands["command"])
+        assert words[:3] == ["python", "-m", "pipeline"]
+        options = parse(words[3:]).params
+        assert (options["server"] is None) == ("server" not in commands)
+        if "server" not in commands:
+            continue
+        words = shlex.split(commands["server"])
+        module = words[words.index("-m") + 1]
+        (server,) = (
+            kind for kind in vars(import_module(module)).values()
+            if isinstance(kind, type) and issubclass(kind, ModelServer) and kind.__module__ == module
+        )  # fmt: skip
+        given = [word.removeprefix("--args.") for word in words if word.startswith("--args.")]
+        assert {*given} <= inspect.signature(server).parameters.keys()
+        assert options["look_every"] == int(words[words.index("--args.chunk_size") + 1])
+    chunk = recipe["training"]["chunk"]["value"]
+    assert f"--args.chunk_size {chunk}" in evaluated["openvla_oft"]["server"]
 
 
 def test_openpi_finds_set_and_statistics_by_the_command_of_the_recipe(tmp_path: Path) -> None:

@@ -6,10 +6,15 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import checkpoints
 import numpy as np
 import pytest
 from anyio.from_thread import start_blocking_portal
-from conftest import REPOSITORY
+from conftest import REPOSITORY, STOVE
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from server_process import running
 from vla_eval.model_servers.base import ModelServer
 from vla_eval.model_servers.groot import GR00TModelServer
@@ -22,10 +27,11 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import PolicyError, checked_actions
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment, evaluate
-from pipeline.evaluation.policies import Server, Wanted
+from pipeline.evaluation.policies import Checkpoint, Server, Wanted, cameras_of
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
+from pipeline.evaluation.tasks import libero_task
 
 FAULTY_AND_STOVE = Selection(
     suites=("libero_object", "libero_goal"), tasks=("pick_up_the_milk*", "push_the_plate*", "turn_on*")
@@ -76,6 +82,51 @@ def memory_given_back() -> Iterator[None]:
 
 
 @pytest.mark.slow
+def images(**keys: int) -> dict[str, PolicyFeature]:
+    """Return image features: name after ``observation.images.`` to height and width."""
+    features = {}
+    for name, size_px in keys.items():
+        features[f"observation.images.{name}"] = PolicyFeature(FeatureType.VISUAL, (3, size_px, size_px))
+    return features
+
+
+OURS = {"observation.images.image": "agentview", "observation.images.image2": "wrist"}
+
+
+def test_checkpoints_that_pad_missing_images_get_the_two_views(tmp_path: Path) -> None:
+    """lerobot's own configurations: pi0.5 as its command for LIBERO sets it, and SmolVLA with its weights' cameras."""
+    pi05 = PI05Config(input_features=images(image=256, image2=224), empty_cameras=1, device="cpu")
+    pi05.validate_features()
+    assert "observation.images.empty_camera_0" in pi05.image_features
+    cameras = cameras_of(pi05, {}, tmp_path)
+    assert {key: camera.view for key, camera in cameras.items()} == OURS
+    assert [camera.size_px for camera in cameras.values()] == [(256, 256), (224, 224)]
+    smolvla = SmolVLAConfig(input_features=images(camera1=256, camera2=256, camera3=256), device="cpu")
+    renamed = {key: f"observation.images.camera{number}" for number, key in enumerate(OURS, 1)}
+    assert {key: camera.view for key, camera in cameras_of(smolvla, renamed, tmp_path).items()} == OURS
+    with pytest.raises(PipelineError, match=r"needs the images .*camera1, .*camera3"):
+        cameras_of(smolvla, {}, tmp_path)
+
+
+def test_a_checkpoint_that_needs_another_image_is_refused(tmp_path: Path) -> None:
+    act = ACTConfig(input_features=images(image=32, front=32), device="cpu")
+    with pytest.raises(PipelineError, match=r"needs the images .*front, which") as found:
+        cameras_of(act, {}, tmp_path)
+    assert "--rename_map" in str(found.value)
+
+
+def test_a_checkpoint_of_renamed_images_acts_like_one_of_ours(tmp_path: Path) -> None:
+    shown = {
+        "images": dict.fromkeys(("agentview", "wrist"), np.zeros((256, 256, 3), np.uint8)),
+        "states": np.zeros(8, np.float32),
+        "task_description": "",
+    }
+    for image in (checkpoints.IMAGE, "observation.images.camera1"):
+        policy = Checkpoint(checkpoints.save(tmp_path / image, 0.25, image=image))
+        policy.begin(libero_task(STOVE, 0))
+        assert policy.act(lambda _: shown) == pytest.approx(np.full((checkpoints.CHUNK, 7), 0.25), abs=1e-6)
+
+
 def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
     with running(FAULTY_SERVER) as address:
         policy = PolicyConfig(kind="server", address=address, label="faulty", timeout_s=10)

@@ -24,7 +24,7 @@ from pipeline.compute.pool import loop
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.harness import ReplayServer
-from pipeline.evaluation.policies import Server, warn_of_single_view
+from pipeline.evaluation.policies import Server, StateAngle, warn_of_requests
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
@@ -159,12 +159,57 @@ def test_a_server_that_does_not_ask_is_warned_of(
     params: dict[str, bool], warned: bool, serve: Serve, caplog: pytest.LogCaptureFixture
 ) -> None:
     address = serve(Asking(**params))
-    warn_of_single_view(address, timeout_s=10, actions="delta")
+    warn_of_requests(address, timeout_s=10, actions="delta", state_angle="server")
     told = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(told) == warned
     for message in told:
         assert message.startswith(f"{address} announces neither send_wrist_image nor send_state")
         assert "only the agent view" in message
+
+
+@pytest.mark.parametrize(
+    ("params", "state_angle", "shortest", "warned"),
+    [
+        ({"send_state": True}, "server", True, True),
+        ({"send_state": True}, "pi", True, False),
+        ({"send_state": True}, "2pi", False, False),
+        ({"send_state": True, "quat_no_antipodal": True}, "server", False, False),
+        ({"send_state": True, "quat_no_antipodal": True}, "pi", True, False),
+        ({"send_state": False, "send_wrist_image": True}, "server", True, False),
+    ],
+)
+def test_the_user_chooses_the_range_of_angles_for_a_server_that_cannot(
+    params: dict[str, bool],
+    state_angle: StateAngle,
+    shortest: bool,
+    warned: bool,
+    serve: Serve,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    address = serve(Asking(**params))
+    warn_of_requests(address, timeout_s=10, actions="delta", state_angle=state_angle)
+    assert ["--state-angle 2pi" in record.getMessage() for record in caplog.records] == [True] * warned
+    with closing(Server(address, state_angle=state_angle)) as server:
+        assert server.wanted.shortest_rotation == shortest
+
+
+def test_the_servers_of_vla_eval_ask_for_the_angles_that_the_warning_names() -> None:
+    """Those of lerobot and pi0 have no parameter for it; that of OpenVLA-OFT asks for [0, 2 pi]."""
+    from vla_eval.model_servers.lerobot import LeRobotModelServer
+    from vla_eval.model_servers.oft import OFTModelServer
+    from vla_eval.model_servers.pi0 import Pi0ModelServer
+
+    attributes = {
+        "state_key": "state", "wrist_image_key": "wrist", "_expected_image_keys": ["a", "b"], "_image_keys_arg": None,
+        "num_images_in_input": 2, "use_proprio": True,
+    }  # fmt: skip
+    requests = {}
+    for kind in (LeRobotModelServer, OFTModelServer, Pi0ModelServer):
+        server = kind.__new__(kind)
+        vars(server).update(attributes)
+        requests[kind] = server.get_observation_params()
+        assert requests[kind]["send_state"]
+    assert [bool(params.get("quat_no_antipodal")) for params in requests.values()] == [False, True, False]
 
 
 @pytest.mark.slow
