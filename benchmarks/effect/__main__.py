@@ -5,7 +5,8 @@
     nice -n 10 python benchmarks/effect evaluate ours 0    # 3. its results, in benchmarks/effect/results
     python benchmarks/effect table                         # 4. table and plot of docs/effect.md, of all results
 
-Each step first runs the missing steps before it. After a stop, the same command resumes. Policies can be trained on
+Each step first runs the missing steps before it. Experiments with held-out perturbations generate the data of all arms
+before an evaluation. After a stop, the same command resumes. Policies can be trained on
 different machines: the results of a policy are one file, to be committed. docs/effect.md reports the costs.
 """
 
@@ -35,16 +36,25 @@ from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum, write
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
+from pipeline.run.claim import owned
+from pipeline.seeding import digest
 
 HERE = Path(__file__).resolve().parent
 sys.path.append(str(HERE.parent))
 
 
-class Trained(NamedTuple):
-    """Configuration and plan of a run that has all episodes of an experiment."""
+class HeldOut(NamedTuple):
+    """Tests on held-out perturbations.
 
-    file: Path
-    plan_file: Path
+    Attributes:
+        tests: the tests, equal for all arms.
+        config: configuration of a run whose plan has the perturbed episodes of all arms.
+        plan_sha256: SHA-256 of this plan.
+    """
+
+    tests: list[EvaluationTask]
+    config: Path
+    plan_sha256: str
 
 
 class Work:
@@ -97,11 +107,12 @@ class Work:
 
     def evaluate(self, arm: str, seed: int, kept: Path) -> Path:
         """Evaluate a policy; write its results into the folder ``kept``, to be committed, and return the file."""
-        self.train(arm, seed)
         import evaluation
         from results import PolicyResults
         from server_process import running
 
+        held_out = self._held_out() if self.experiment.evaluation.held_out else None
+        self.train(arm, seed)
         policy = self.policy(arm, seed)
         weights = checksum(policy / "model.safetensors")
         # The label has the weights' hash, as an earlier policy of the same settings has different results.
@@ -116,11 +127,10 @@ class Work:
             server = ("--server", address, "--label", label)
             rows = run_tests(tested, folder, *server)
             seen = run_tests(in_libero, folder / "black", *server, "--black", "all")
-            if self.experiment.evaluation.held_out:
-                trained = self._trained(folder)
-                held_out = evaluation.held_out_tests(self.experiment, own_draws.planned(trained.plan_file))
-                rows += run_tests(held_out, folder / "held_out", *server, "--trained-on", str(trained.file))
-            reading = evaluation.obedience(self.experiment, address, folder / "reading")
+            if held_out:
+                options = (*server, "--trained-on", str(held_out.config))
+                rows += run_tests(held_out.tests, folder / "held_out", *options, plan_sha256=held_out.plan_sha256)
+            reading = evaluation.run_instructed_episodes(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)
         losses = (policy / "training.jsonl").read_text().splitlines()
         made: dict[str, Any] = {
@@ -128,6 +138,7 @@ class Work:
             "episodes_by_axis": episodes.read(dataset).axes(),
             "sentences_sha256": checksum(sentences.FILE),
             "policy_sha256": weights,
+            "plan_of_all_arms_sha256": held_out.plan_sha256 if held_out else None,
             "losses": [[entry["step"], entry["loss"]] for entry in map(json.loads, losses[9::10])],
             "packages": {name: version(name) for name in ("torch", "torchvision", "lerobot")},
             "seconds": self._seconds(),
@@ -140,17 +151,22 @@ class Work:
         nothing = [{"task": row.base, "state": row.number, "success": row.success} for row in seen]
         return PolicyResults(arm, seed, settings, made, rows, reading, nothing).write(kept)
 
-    def _trained(self, folder: Path) -> Trained:
-        """Write the perturbed episodes of all arms as the plan of one run, so that tests are equal for all arms."""
+    def _held_out(self) -> HeldOut:
+        """Select the held-out perturbations, after the data of all arms are generated."""
+        import evaluation
+
         rows: list[plan.Row] = []
         for arm in self.experiment.arms:
             self.make_data(arm)
-            rows += episodes.trained_on(self.dataset(arm))
+            rows += episodes.perturbed_rows(self.dataset(arm))
+        names = [self.experiment.dataset_name(arm) for arm in self.experiment.arms]
+        config = self.out / f"all_arms_{digest(names)[:8]}.yaml"
         sections = self.experiment.run.model_dump(mode="json", include={"demos", "plan"}, exclude_defaults=True)
-        trained = Trained(folder / "trained.yaml", folder / "trained" / "plan.parquet")
-        write(trained.file, yaml.safe_dump({"name": "trained", "folder": str(folder), **sections}))
-        plan.write(rows, trained.plan_file)
-        return trained
+        write(config, yaml.safe_dump({"name": config.stem, "folder": str(self.out), **sections}))
+        plan_file = owned(config).plan_file
+        plan.write(rows, plan_file)
+        tests = evaluation.held_out_tests(self.experiment, own_draws.planned(plan_file))
+        return HeldOut(tests, config, own_draws.sha256_of(plan_file))
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -173,12 +189,30 @@ class Work:
         return taken
 
 
-def run_tests(tests: Sequence[EvaluationTask], folder: Path, *options: str) -> list[EpisodeResult]:
-    """Evaluate on the tests without results in the folder; return the results of all tests whose scene was accepted."""
-    tasks, wanted = folder.with_name(f"{folder.name}_tasks.json"), set(tests)
+def run_tests(
+    tests: Sequence[EvaluationTask], folder: Path, *options: str, plan_sha256: str | None = None
+) -> list[EpisodeResult]:
+    """Evaluate on the tests without results in the folder; return the results of all tests whose scene was accepted.
+
+    Args:
+        plan_sha256: SHA-256 of the plan from which held-out perturbations keep their clearance.
+
+    Raises:
+        PipelineError: if a test has no result.
+    """
+    tasks = folder.with_name(f"{folder.name}_tasks.json")
     write_tasks(tests, 0, tasks)
     run("-m", "pipeline", "evaluate", str(folder), "--tasks-from", str(tasks), *options)
-    return [row for row in EpisodeFiles(folder).rows() if row.trial[0] in wanted and row.reason != REFUSED]
+    # A result has the component of the perturbation that the scene accepted.
+    of_test: dict[tuple[str, str, str, int], EpisodeResult] = {}
+    for row in EpisodeFiles(folder).rows():
+        if row.settings.get("plan") == plan_sha256:
+            of_test[row.source, row.suite, row.name, row.number] = row
+    names = [(test.source, test.suite, test.name, test.number) for test in tests]
+    missing = [name for name in names if name not in of_test]
+    if missing:
+        raise PipelineError(f"{len(missing)} of {len(tests)} tests have no result, such as {missing[0]}", where=folder)
+    return [of_test[name] for name in names if of_test[name].reason != REFUSED]
 
 
 def run(*words: str) -> None:

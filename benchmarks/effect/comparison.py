@@ -104,6 +104,7 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
             pairs: list[Pair] = []
             for seed in sorted(seeds):
                 pairs += paired(episodes[first][seed], episodes[second][seed])
+            assert len(pairs) == sum(len(episodes[first][seed]) for seed in seeds), "all arms have equal tests"
             if pairs:
                 measured = compare(pairs)["all"]["difference"]
                 p_value = max(measured["p_value"] or 0.0, sign_flip(pairs))

@@ -130,11 +130,12 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
     return rows + clean, [row for row in rows if row.role == "perturbed"] + clean
 
 
-def trained_on(dataset: Path) -> list[plan.Row]:
-    """Return the rows of a dataset's perturbed episodes in the plan, without unused candidates."""
-    trained = {row["episode_id"] for row in read(dataset).episodes}
-    rows = plan.read(dataset.with_suffix("") / "plan.parquet")
-    return [row for row in rows if row.role == "perturbed" and row.episode_id in trained]
+def perturbed_rows(file: Path) -> list[plan.Row]:
+    """Return the rows of the plan of a dataset's perturbed episodes, without unused candidates."""
+    with np.load(file) as arrays:
+        kept = {row["episode_id"] for row in json.loads(str(arrays["episodes"]))}
+    rows = plan.read(file.with_suffix("") / "plan.parquet")
+    return [row for row in rows if row.role == "perturbed" and row.episode_id in kept]
 
 
 def _write(rows: Sequence[plan.Row], load: EpisodeLoader, frame_px: int, workers: Workers, file: Path) -> None:

@@ -26,6 +26,9 @@ from pipeline.files import read_json, write_json
 from pipeline.libero.carried import carried, definition_of
 from pipeline.types import Task
 
+CANDIDATES_OF_A_TEST = 5
+"""Number of candidates of each level for a test on a held-out perturbation."""
+
 
 def tested(experiment: Experiment) -> list[EvaluationTask]:
     """Select LIBERO's initial states, test tasks of LIBERO-Plus, and held-out goals.
@@ -49,14 +52,16 @@ def held_out_tests(experiment: Experiment, trained: PlannedDraws) -> list[Evalua
     """Select held-out perturbations of each task, equally for all arms.
 
     Each test has a sample that keeps its clearance from the episodes of all arms. ``evaluate --trained-on`` takes the
-    first such sample that the scene accepts.
+    first such sample that the scene accepts. Levels take turns as far as they have such samples: perturbations with
+    many textures or objects rarely have one.
 
     Raises:
         PipelineError: if a task has too few such perturbations.
     """
     chosen: list[EvaluationTask] = []
     for task, (axis, number) in product(find_tasks(experiment.tasks), experiment.evaluation.held_out.items()):
-        candidates = Selection(source="own", suites=(task.suite,), tasks=(task.name,), axes=(axis,), episodes=number)
+        episodes = number * CANDIDATES_OF_A_TEST
+        candidates = Selection(source="own", suites=(task.suite,), tasks=(task.name,), axes=(axis,), episodes=episodes)
         apart: list[EvaluationTask] = []
         for test in select(candidates):
             draws = (draw(test, candidates.seed, attempt) for attempt in range(ATTEMPTS))
@@ -104,7 +109,7 @@ def instructed_episodes(experiment: Experiment) -> list[InstructedEpisode]:
     return [InstructedEpisode(instruction, state) for instruction, state in product(instructions, states)]
 
 
-def obedience(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:
+def run_instructed_episodes(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:
     """Run the episodes without results in the folder.
 
     Args:
@@ -120,12 +125,12 @@ def obedience(experiment: Experiment, address: str, folder: Path) -> list[dict[s
     missing = [episode for episode in wanted if not (folder / episode.file).exists()]
     if missing:
         with runner(ComputeConfig(), folder, renders=True) as workers:
-            job = partial(_run_instructed, find_tasks(experiment.tasks), address, folder)
+            job = partial(_run_some, find_tasks(experiment.tasks), address, folder)
             workers(job, [missing[::2], missing[1::2]], "reading, halves")
     return [read_json(folder / episode.file) for episode in wanted]
 
 
-def _run_instructed(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[InstructedEpisode]) -> None:
+def _run_some(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[InstructedEpisode]) -> None:
     environment, policy = EpisodeEnvironment(), Server(address)
     for instructed in wanted:
         instruction = instructed.instruction

@@ -53,7 +53,7 @@ class EvaluationConfig(Frozen):
     Attributes:
         states: number of LIBERO's initial states of each task, counted from the first.
         libero_plus: axis to the number of LIBERO-Plus's test tasks of each task.
-        held_out: axis to the number of held-out perturbations of each task, spread over the levels.
+        held_out: axis to the number of held-out perturbations of each task.
         held_out_goals: number of LIBERO's initial states of each scene, counted from the first, with each goal that no
             plan carries to the scene.
         reading_states: number of initial states of each scene, counted from the last, with each instruction.
@@ -182,18 +182,23 @@ def read(path: Path) -> Experiment:
         PipelineError: names the file and every invalid field.
     """
     try:
-        settings = yaml.safe_load(path.read_text())
-        base = settings.pop("base", None) if isinstance(settings, dict) else None
-        if base:
-            settings_of_base = yaml.safe_load((path.parent / base).read_text())
-            sections: dict[str, Any] = {}
-            for name, section in settings.items():
-                if isinstance(section, dict) and name != "arms":
-                    sections[name] = settings_of_base.get(name, {}) | section
-            settings = settings_of_base | settings | sections
-        return Experiment.model_validate(settings)
+        return Experiment.model_validate(_with_base(path))
     except (OSError, yaml.YAMLError) as error:
         raise PipelineError(f"cannot read the experiment ({error})", where=path) from error
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, fault['loc'])) or 'top level'}: {fault['msg']}" for fault in error.errors()]
         raise PipelineError("the experiment is not valid:\n    " + "\n    ".join(faults), where=path) from error
+
+
+def _with_base(path: Path) -> Any:
+    """Read a file's settings, merged with those of its base."""
+    settings = yaml.safe_load(path.read_text())
+    base = settings.pop("base", None) if isinstance(settings, dict) else None
+    if not base:
+        return settings
+    settings_of_base = _with_base(path.parent / base)
+    sections: dict[str, Any] = {}
+    for name, section in settings.items():
+        if isinstance(section, dict) and name != "arms":
+            sections[name] = settings_of_base.get(name, {}) | section
+    return settings_of_base | settings | sections

@@ -21,7 +21,7 @@ class PolicyResults:
         settings: settings of the experiment, and the tasks.
         made: hashes of data, sentences and policy, axes of the episodes, losses, packages, and times of the steps.
         rows: episodes of test tasks.
-        reading: rows of ``evaluation.obedience``.
+        reading: rows of ``evaluation.run_instructed_episodes``.
         black: ``task``, ``state`` and ``success`` from LIBERO's own states with both views black.
     """
 
@@ -42,6 +42,7 @@ class PolicyResults:
             "settings": self.settings,
             "sentences": self.made.get("sentences_sha256"),
             "packages": self.made.get("packages"),
+            "plans of all arms": self.made.get("plan_of_all_arms_sha256"),
             "versions": versions,
         }
 

@@ -51,8 +51,11 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
-    assert further.keys() == {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes"}
-    axes = further.pop("axes")
+    assert further.keys() == {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes", "axes_relative"}
+    axes, relative = further.pop("axes"), further.pop("axes_relative")
+    assert relative == axes.model_copy(update={"arms": relative.arms, "training": relative.training})
+    assert relative.training == axes.training.model_copy(update={"proprioception": "relative"})
+    assert [*relative.arms.values()] == [*axes.arms.values()]
     assert (axes.policy, axes.training) == (further["no_state"].policy, further["no_state"].training)
     same = {"plan": {"episodes", "reserve", "axes"}}
     assert axes.run.model_dump(exclude=same) == shipped.run.model_dump(exclude=same)
@@ -122,7 +125,7 @@ def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> N
 
 
 def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipped: Experiment) -> None:
-    """Textures, categories of objects and lights are compared by their names and numbers."""
+    """Textures and objects are compared by their names; a light must differ from every planned one in its numbers."""
     experiment = read(EFFECT / "further" / "axes.yaml")
     demos, trained = demonstrations(experiment, 86), []
     for arm in experiment.arms:
@@ -130,10 +133,12 @@ def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipp
         trained += [row for row in chosen if row.wanted and row.role == "perturbed"]
     textures: set[str] = set()
     objects: set[str] = set()
+    lights: list[dict[str, Any]] = []
     for row in trained:
         for perturbation in json.loads(row.perturbations):
-            textures |= {covering["texture"] for covering in perturbation.get("coverings", ())}
-            objects |= {added["category"] for added in perturbation.get("objects", ())}
+            textures |= textures_of(perturbation)
+            objects |= objects_of(perturbation)
+            lights += [perturbation] if perturbation["axis"] == "light" else []
     planned = PlannedDraws(trained)
     tests = evaluation.held_out_tests(experiment, planned)
     assert Counter((test.base, test.axis) for test in tests) == {
@@ -141,10 +146,20 @@ def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipp
     }
     for test in tests:
         task = find_task(test.suite, test.base)
-        drawn = next(one for one in (draw(test, 0, attempt) for attempt in range(20)) if not planned.overlap(one, task))
-        content = json.loads(to_json([drawn]))[0]
-        assert textures.isdisjoint(covering["texture"] for covering in content.get("coverings", ()))
-        assert objects.isdisjoint(added["category"] for added in content.get("objects", ()))
+        samples = (draw(test, 0, attempt) for attempt in range(20))
+        first = next(sample for sample in samples if not planned.overlap(sample, task))
+        (content,) = json.loads(to_json([first]))
+        assert textures.isdisjoint(textures_of(content))
+        assert objects.isdisjoint(objects_of(content))
+        assert content not in lights
+
+
+def textures_of(perturbation: dict[str, Any]) -> set[str]:
+    return {covering["texture"] for covering in perturbation.get("coverings", ())}
+
+
+def objects_of(perturbation: dict[str, Any]) -> set[str]:
+    return {added["category"] for added in perturbation.get("objects", ())}
 
 
 def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:

@@ -63,6 +63,7 @@ def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
     others: dict[str, dict[str, Any]] = {
         "settings": {"settings": {"frame_px": 32}},
         "packages": {"made": {"packages": {"torch": "1.0"}}},
+        "plans of all arms": {"made": {"plan_of_all_arms_sha256": "0"}},
     }
     for what, changed in others.items():
         replace(written[0], arm="other", **changed).write(tmp_path)

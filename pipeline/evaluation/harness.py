@@ -26,7 +26,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import checked_actions, refuse_other_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import check_settings
-from pipeline.evaluation.policies import NextLook, Wanted
+from pipeline.evaluation.policies import NextLook, Wanted, is_shortest
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
@@ -103,7 +103,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
                 remedy="set out: DIR in addition to label",
             )
         self._next_look = NextLook(self._environment.settings.look_every)
-        self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
+        self._wanted = Wanted(send_wrist_image, send_state, is_shortest(episodes.state_angle, quat_no_antipodal))
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """Return one task per episode; ``name`` is unique, ``suite`` is LIBERO's."""

@@ -43,6 +43,16 @@ class Wanted(NamedTuple):
     images: bool = True
 
 
+def is_shortest(state_angle: StateAngle, no_antipodal: bool) -> bool:
+    """Return ``Wanted.shortest_rotation``.
+
+    Args:
+        state_angle: the user's choice.
+        no_antipodal: vla-eval's parameter ``quat_no_antipodal``, by which a server requests [0, 2 pi].
+    """
+    return not no_antipodal if state_angle == "server" else state_angle == "pi"
+
+
 Look = Callable[[Wanted], dict[str, Any]]
 """Function that returns the observation; a call renders the frames."""
 
@@ -198,7 +208,7 @@ class Server:
         except PipelineError:
             self.close()
             raise
-        shortest = not wanted.get("quat_no_antipodal") if self._state_angle == "server" else self._state_angle == "pi"
+        shortest = is_shortest(self._state_angle, bool(wanted.get("quat_no_antipodal")))
         self.wanted = Wanted(bool(wanted.get("send_wrist_image")), bool(wanted.get("send_state")), shortest)
 
     def _run(self, awaited: Any, limit_s: float | None = None) -> Any:
@@ -227,7 +237,7 @@ class Server:
 def warn_of_requests(address: str, timeout_s: float, actions: Actions, state_angle: StateAngle) -> None:
     """Log a warning if a server gets an observation that its author may not have meant.
 
-    It may announce none of ``REQUESTS``, or get the state with angles in [0, pi] without a decision of the user.
+    It may announce none of ``REQUESTS``, or get the state with angles in [0, pi] although the user did not choose this.
 
     Args:
         address: address of the server, such as ``ws://localhost:8000``.
@@ -236,14 +246,20 @@ def warn_of_requests(address: str, timeout_s: float, actions: Actions, state_ang
         state_angle: as ``Server``.
 
     Raises:
-        PipelineError: as ``Server``.
+        PipelineError: as ``Server``, or if the user chose angles for a server that gets no state.
     """
     with closing(Server(address, timeout_s, actions=actions, state_angle=state_angle)) as server:
+        if state_angle != "server" and not server.wanted.state:
+            raise PipelineError(
+                "the server does not request the state, so its angles have no effect",
+                where="state_angle",
+                remedy="leave --state-angle out, or return send_state from the server's get_observation_params",
+            )
         if server.wanted.state and server.wanted.shortest_rotation and state_angle == "server":
             logging.getLogger(__name__).warning(
                 "%s gets the state with angles in [0, pi], as it does not request quat_no_antipodal. A policy that was "
-                "trained on these datasets or on LIBERO's states needs --state-angle 2pi. --state-angle pi silences "
-                "this warning (docs/model-server.md)",
+                "trained on these datasets or on LIBERO's states needs --state-angle 2pi "
+                "(docs/model-server.md)",
                 address,
             )
         if not server.states_request:
@@ -271,7 +287,8 @@ class Camera(NamedTuple):
 def cameras_of(config: Any, renamed: Mapping[str, str], folder: Path) -> dict[str, Camera]:
     """Map the key of each image that a policy gets, as in the datasets, to its camera.
 
-    A policy with ``empty_cameras``, such as SmolVLA and pi0.5, acts without some of its images.
+    A policy with ``empty_cameras``, such as SmolVLA and pi0.5, acts without some of its images if it gets both views. A
+    warning names these images.
 
     Args:
         config: lerobot's configuration of the policy.
@@ -288,12 +305,17 @@ def cameras_of(config: Any, renamed: Mapping[str, str], folder: Path) -> dict[st
         if feature is not None:
             _, height, width = feature.shape
             cameras[key] = Camera(view, (height, width))
-    if wanted and not (cameras and hasattr(config, "empty_cameras")):
+    if wanted and not (len(cameras) == len(offered) and hasattr(config, "empty_cameras")):
         raise PipelineError(
             f"the policy needs the images {', '.join(wanted)}, which the tasks do not have",
             where=folder,
             expected=", ".join(offered),
             remedy="train with lerobot's --rename_map, which the checkpoint keeps",
+        )
+    unfed = [key for key in wanted if "empty_camera" not in key]
+    if unfed:
+        logging.getLogger(__name__).warning(
+            "the tasks have no image for %s, so %s acts without it", " and ".join(unfed), folder
         )
     return cameras
 

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import checkpoints
 import numpy as np
@@ -81,7 +82,6 @@ def memory_given_back() -> Iterator[None]:
     _environment.cache_clear()
 
 
-@pytest.mark.slow
 def images(**keys: int) -> dict[str, PolicyFeature]:
     """Return image features: name after ``observation.images.`` to height and width."""
     features = {}
@@ -93,7 +93,9 @@ def images(**keys: int) -> dict[str, PolicyFeature]:
 OURS = {"observation.images.image": "agentview", "observation.images.image2": "wrist"}
 
 
-def test_checkpoints_that_pad_missing_images_get_the_two_views(tmp_path: Path) -> None:
+def test_checkpoints_that_pad_missing_images_get_the_two_views(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """lerobot's own configurations: pi0.5 as its command for LIBERO sets it, and SmolVLA with its weights' cameras."""
     pi05 = PI05Config(input_features=images(image=256, image2=224), empty_cameras=1, device="cpu")
     pi05.validate_features()
@@ -104,8 +106,10 @@ def test_checkpoints_that_pad_missing_images_get_the_two_views(tmp_path: Path) -
     smolvla = SmolVLAConfig(input_features=images(camera1=256, camera2=256, camera3=256), device="cpu")
     renamed = {key: f"observation.images.camera{number}" for number, key in enumerate(OURS, 1)}
     assert {key: camera.view for key, camera in cameras_of(smolvla, renamed, tmp_path).items()} == OURS
-    with pytest.raises(PipelineError, match=r"needs the images .*camera1, .*camera3"):
-        cameras_of(smolvla, {}, tmp_path)
+    assert [record.getMessage().count("camera3, so") for record in caplog.records] == [1]
+    for lost in ({}, {"observation.images.image": "observation.images.camera1"}):
+        with pytest.raises(PipelineError, match=r"needs the images .*camera3, which"):
+            cameras_of(smolvla, lost, tmp_path)
 
 
 def test_a_checkpoint_that_needs_another_image_is_refused(tmp_path: Path) -> None:
@@ -116,17 +120,25 @@ def test_a_checkpoint_that_needs_another_image_is_refused(tmp_path: Path) -> Non
 
 
 def test_a_checkpoint_of_renamed_images_acts_like_one_of_ours(tmp_path: Path) -> None:
+    """It gets the agent view under its own name."""
+    agent_view = np.resize(np.arange(251, dtype=np.uint8), (32, 32, 3))
     shown = {
-        "images": dict.fromkeys(("agentview", "wrist"), np.zeros((256, 256, 3), np.uint8)),
+        "images": {"agentview": agent_view, "wrist": np.zeros((256, 256, 3), np.uint8)},
         "states": np.zeros(8, np.float32),
         "task_description": "",
     }
     for image in (checkpoints.IMAGE, "observation.images.camera1"):
         policy = Checkpoint(checkpoints.save(tmp_path / image, 0.25, image=image))
+        seen: dict[str, Any] = {}
+        processed = policy._before
+        policy._before = lambda batch, process=processed, seen=seen: seen.setdefault("batch", process(batch))
         policy.begin(libero_task(STOVE, 0))
         assert policy.act(lambda _: shown) == pytest.approx(np.full((checkpoints.CHUNK, 7), 0.25), abs=1e-6)
+        network_input = seen["batch"][image][0].numpy()
+        assert network_input == pytest.approx(agent_view.transpose(2, 0, 1) / 255, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
     with running(FAULTY_SERVER) as address:
         policy = PolicyConfig(kind="server", address=address, label="faulty", timeout_s=10)

@@ -21,9 +21,10 @@ from vla_eval.model_servers.serve import serve_async
 
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop
+from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.harness import ReplayServer
+from pipeline.evaluation.harness import PerturbedLibero, ReplayServer
 from pipeline.evaluation.policies import Server, StateAngle, warn_of_requests
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
@@ -210,6 +211,18 @@ def test_the_servers_of_vla_eval_ask_for_the_angles_that_the_warning_names() -> 
         requests[kind] = server.get_observation_params()
         assert requests[kind]["send_state"]
     assert [bool(params.get("quat_no_antipodal")) for params in requests.values()] == [False, True, False]
+
+
+def test_angles_for_a_server_without_the_state_are_refused(serve: Serve) -> None:
+    address = serve(Asking(send_wrist_image=True))
+    with pytest.raises(PipelineError, match="does not request the state"):
+        warn_of_requests(address, timeout_s=10, actions="delta", state_angle="2pi")
+
+
+@pytest.mark.parametrize(("state_angle", "shortest"), [("server", True), ("pi", True), ("2pi", False)])
+def test_the_harness_gives_the_angles_that_its_settings_state(state_angle: StateAngle, shortest: bool) -> None:
+    benchmark = PerturbedLibero(settings={"state_angle": state_angle}, send_state=True)
+    assert benchmark._wanted.shortest_rotation == shortest
 
 
 @pytest.mark.slow
