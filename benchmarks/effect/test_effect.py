@@ -80,8 +80,8 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
     same = {"plan": {"episodes", "reserve", "axes"}}
     assert further["starts"].run.model_dump(exclude=same) == shipped.run.model_dump(exclude=same)
     of_goals = results.read(EFFECT / "further" / "results" / "goals")
-    assert [(made.arm, made.seed) for made in of_goals] == [("usual", 0), ("goals", 0)]
-    assert [made.made["episodes_by_axis"].get("goal", 0) for made in of_goals] == [0, 70]
+    assert [(made.arm, made.seed) for made in of_goals] == [("usual", 0), ("usual", 1), ("goals", 0), ("goals", 1)]
+    assert [made.made["episodes_by_axis"].get("goal", 0) for made in of_goals] == [0, 0, 70, 70]
     trained = {
         "pre_norm": [("clean", 0), ("ours", 0)],
         "no_state": [("clean", 0), ("clean", 1), ("ours", 0), ("ours", 1)],
