@@ -6,8 +6,8 @@
     python benchmarks/effect table                         # 4. table and plot of docs/effect.md, of all results
 
 Each step first runs the missing steps before it. Experiments with held-out perturbations generate the data of all arms
-before an evaluation. After a stop, the same command resumes. Policies can be trained on
-different machines: the results of a policy are one file, to be committed. docs/effect.md reports the costs.
+before an evaluation. After a stop, the same command resumes. Policies can be trained on different machines: the results
+of a policy are one file, to be committed. docs/effect.md reports the costs.
 """
 
 import argparse

@@ -16,14 +16,15 @@ VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
-    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    "MALLOC_MMAP_THRESHOLD_": str(256 << 10),
     "__GL_YIELD": "USLEEP",
 }
 """Environment variables of a worker process, which it inherits; Dask's own values give way to them.
 
 A worker has one thread, as GL contexts and the simulator are not shared, but OpenCV and NumPy would start a thread for
 every core. Dask makes glibc return every 64 KB that are free to the system. In software rendering, each frame may then
-request thousands of pages again, up to a tenth of a worker's time. While workers wait for a GPU that they share,
+request thousands of pages again, up to a tenth of a worker's time. Blocks of 256 KB and more are returned at once: the
+compilation of a scene frees 100 MB of them, and a frame is smaller. While workers wait for a GPU that they share,
 NVIDIA's OpenGL driver for Linux keeps their cores busy, unless ``__GL_YIELD`` makes it sleep
 (``benchmarks/LOG.md``).
 """

@@ -343,12 +343,9 @@ def _reasons(
             notes.append("cap")
         elif isclose(share, limits.floor * share_before):
             notes.append("floor")
-        reasons.append(
-            Reason(
-                *(kind, name, _failures(of_name), len(of_name), rates[name]),
-                *(share_before, share, written[name], ", ".join(notes)),
-            )
-        )
+        counts = _failures(of_name), len(of_name)
+        note = ", ".join(notes)
+        reasons.append(Reason(kind, name, *counts, rates[name], share_before, share, written[name], note))
     return reasons
 
 

@@ -258,8 +258,7 @@ def warn_of_requests(address: str, timeout_s: float, actions: Actions, state_ang
         if server.wanted.state and server.wanted.shortest_rotation and state_angle == "server":
             logging.getLogger(__name__).warning(
                 "%s gets the state with angles in [0, pi], as it does not request quat_no_antipodal. A policy that was "
-                "trained on these datasets or on LIBERO's states needs --state-angle 2pi "
-                "(docs/model-server.md)",
+                "trained on these datasets or on LIBERO's states needs --state-angle 2pi (docs/model-server.md)",
                 address,
             )
         if not server.states_request:

@@ -1,7 +1,5 @@
 """Compiled scenes in their states, for perturbations that depend on the places of things."""
 
-import ctypes
-import sys
 import xml.etree.ElementTree as ET
 from functools import lru_cache
 from typing import NamedTuple
@@ -31,16 +29,7 @@ def compiled(model_xml: str) -> mujoco.MjModel:
     model = mujoco.MjModel.from_xml_string(model_xml)
     # MuJoCo keeps the last document that it read, images included, until it reads another document: 300 MB.
     mujoco.MjModel.from_xml_string("<mujoco/>")
-    _return_free_memory()
     return model
-
-
-def _return_free_memory() -> None:
-    """Return freed memory to the system: 200 MB after a scene, which glibc would keep for this process."""
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:  # Other C libraries of Linux do not have it.
-            trim(0)
 
 
 @lru_cache(maxsize=2)
