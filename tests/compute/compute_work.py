@@ -8,7 +8,8 @@ from pathlib import Path
 from pipeline import gl
 from pipeline.errors import PipelineError
 
-BLOCK_BYTES = 2**19
+BLOCK_BYTES = 3 * 256 * 256
+"""Bytes of a frame of 256 pixels."""
 
 
 def square(number: int) -> int:
