@@ -53,12 +53,14 @@ class PlainDrawing:
     Attributes:
         steps_ahead: number of steps, of up to two views each, to start by ``start_frame`` before the frames of an
             earlier step are taken; 0 if the device does not work meanwhile.
+        adopts: True if the context may be able to switch to another model (``adopt``).
 
     Raises:
         PipelineError: if this machine cannot render.
     """
 
     steps_ahead = 0
+    adopts = False
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
@@ -93,6 +95,12 @@ class PlainDrawing:
         If the result is False, nothing has changed. After an error, close this ``PlainDrawing``.
         """
         return False
+
+    def release(self) -> None:
+        """Drop the reference to the model, so that its memory can be freed; only ``adopt`` or ``close`` may follow.
+
+        Only an object that ``adopts`` has this method's use.
+        """
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:
         """Render a frame (H, W, 3) of uint8 RGB, in the orientation of LIBERO's raw observations.

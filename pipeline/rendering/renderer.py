@@ -111,13 +111,14 @@ class LastScene:
     """
 
     def __init__(self) -> None:
+        self._drawing: PlainDrawing | None = None
         self._renderer: Renderer | None = None
         self._scene: str | mujoco.MjModel | None = None
 
     def renderer(self, scene: str | mujoco.MjModel, size_px: int = SIZE_PX) -> Renderer:
         """Return the renderer of a scene.
 
-        A request for another scene or size makes the returned renderer unusable.
+        A request for another scene or size makes the returned renderer unusable. After an error, no scene is open.
 
         Args:
             scene: the scene's MJCF, or a compiled model, which must not change while its renderer is used.
@@ -128,31 +129,41 @@ class LastScene:
             ValueError: if MuJoCo rejects the scene or one of its images.
         """
         is_scene = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
-        has_size = self._renderer is not None and self._renderer.drawing.size_px == size_px
+        has_size = self._drawing is not None and self._drawing.size_px == size_px
         if self._renderer is not None and is_scene and has_size:
             return self._renderer
-        model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         try:
-            adopted = self._renderer is not None and has_size and self._renderer.drawing.adopt(model)
+            if self._drawing is not None and has_size and self._drawing.adopts:
+                # A model takes 200 MB; the former model is freed before the next one is compiled.
+                self._renderer = self._scene = None
+                self._drawing.release()
+            else:
+                self.close()
+            self._renderer = self._opened(compiled(scene) if isinstance(scene, str) else copy.copy(scene), size_px)
         except BaseException:
             # The context may have parts of both scenes now.
             self.close()
             raise
-        if self._renderer is not None and adopted:
-            self._renderer = Renderer(model, self._renderer.drawing)
-        else:
-            self.close()
-            self._renderer = Renderer(model, size_px=size_px)
-            # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
-            atexit.register(self.close)
         self._scene = scene
         return self._renderer
 
+    def _opened(self, model: mujoco.MjModel, size_px: int) -> Renderer:
+        """Open the renderer of a model in the context of the former model if possible, otherwise in a new context."""
+        if self._drawing is not None and self._drawing.adopt(model):
+            return Renderer(model, self._drawing)
+        self.close()
+        renderer = Renderer(model, size_px=size_px)
+        self._drawing = renderer.drawing
+        # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
+        atexit.register(self.close)
+        return renderer
+
     def close(self) -> None:
-        if self._renderer is not None:
+        self._renderer = self._scene = None
+        if self._drawing is not None:
             atexit.unregister(self.close)
-            self._renderer.close()
-            self._renderer = self._scene = None
+            self._drawing.close()
+            self._drawing = None
 
 
 @functools.cache

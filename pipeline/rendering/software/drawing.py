@@ -96,16 +96,20 @@ class SoftwareDrawing(PlainDrawing):
     """
 
     chooses_faces = True
+    adopts = True
 
     def __init__(self, model: mujoco.MjModel, size_px: int = SIZE_PX):
         # Create the context for the common parts of all scenes, and then switch it to this model.
-        bare = private.bare(model)
-        super().__init__(bare, size_px)
+        self._bare = private.bare(model)
+        super().__init__(self._bare, size_px)
         with ExitStack() as undo:
             undo.callback(self.close)
             self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
-            self._meshes = Meshes(self._context, bare, [])
-            self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, np.zeros(bare.ngeom, np.bool_))
+            self._textures = private.textures_of(self._bare)
+            self._meshes = Meshes(self._context, self._bare, [])
+            self._skinned = SkinnedMeshes(
+                self._skins, self._samples, self._meshes, np.zeros(self._bare.ngeom, np.bool_)
+            )
             self._still: dict[str, Still] = {}
             self._underlays: dict[str, Underlay] = {}
             self._show(model)
@@ -129,9 +133,15 @@ class SoftwareDrawing(PlainDrawing):
         self._show(model)
         return True
 
+    def release(self) -> None:
+        """Drop the reference to the model; the context keeps its meshes and textures."""
+        self._model = self._meshes.model = self._bare
+        del self._culling
+
     def _show(self, model: mujoco.MjModel) -> None:
         """Replace the former model in the context; meshes and textures of both models stay."""
-        private.adopt_textures(self._context, model, self._model)
+        former, self._textures = self._textures, private.textures_of(model)
+        private.adopt_textures(self._context, model, self._textures, former)
         private.adopt_size(self._context, model)
         self._model = model
         hidden_groups = np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist()
@@ -146,6 +156,8 @@ class SoftwareDrawing(PlainDrawing):
     def load(self, textures: Collection[int]) -> None:
         """Upload these textures from the model's ``tex_data``, and forget all underlays, which show the old ones."""
         super().load(textures)
+        for texture in textures:
+            self._textures[texture] = private.texture_of(self._model, texture)
         if textures:
             self._forget_underlays()
 

@@ -1,6 +1,9 @@
 """A context of MuJoCo 3.2.7 that switches from one model to the next and keeps the textures of both."""
 
+import hashlib
+from collections.abc import Sequence
 from operator import attrgetter
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -66,19 +69,48 @@ _SKY = -mujoco.mjtTextureRole.mjNTEXROLE + mujoco.mjtTextureRole.mjTEXROLE_RGB
 """
 
 
-def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mujoco.MjModel) -> None:
+class Texture(NamedTuple):
+    """Identity of a texture.
+
+    Attributes:
+        kind: type, height, width and number of channels.
+        digest: hash of the texels.
+    """
+
+    kind: tuple[int, int, int, int]
+    digest: bytes
+
+
+def textures_of(model: mujoco.MjModel) -> list[Texture]:
+    """Return the identity of each texture of a model."""
+    return [texture_of(model, number) for number in range(model.ntex)]
+
+
+def texture_of(model: mujoco.MjModel, number: int) -> Texture:
+    """Return the identity of a model's texture."""
+    columns = (model.tex_type, model.tex_height, model.tex_width, model.tex_nchannel)
+    kind, height_px, width_px, channels = (int(column[number]) for column in columns)
+    return Texture((kind, height_px, width_px, channels), hashlib.sha256(texels(model)[number].data).digest())
+
+
+def adopt_textures(
+    context: mujoco.MjrContext, model: mujoco.MjModel, textures: Sequence[Texture], former: Sequence[Texture]
+) -> None:
     """Replace a former model's textures in a context by a model's textures.
 
     Textures that both models have stay in the context: a scene has 140 MB of textures.
+
+    Args:
+        context: the context.
+        model: the model.
+        textures: the model's textures.
+        former: the textures in the context.
     """
-    kinds, former_kinds = _texture_kinds(model), _texture_kinds(former)
-    former_texels = texels(former)
-    unclaimed = dict(enumerate(context.texture[: len(former_texels)].tolist()))
+    unclaimed = dict(enumerate(context.texture[: len(former)].tolist()))
     new_textures = []
-    for texture, values in enumerate(texels(model)):
+    for texture, identity in enumerate(textures):
         for number in unclaimed:
-            same_kind = kinds[texture] == former_kinds[number]
-            if same_kind and np.array_equal(values, former_texels[number]):
+            if former[number] == identity:
                 context.texture[texture] = unclaimed.pop(number)
                 break
         else:
@@ -95,9 +127,3 @@ def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mu
     for texture in new_textures:
         mujoco.mjr_uploadTexture(model, context, texture)
         check("mjr_uploadTexture")
-
-
-def _texture_kinds(model: mujoco.MjModel) -> list[tuple[int, int, int, int]]:
-    """Return the type, height, width and number of channels of each texture."""
-    columns = (model.tex_type, model.tex_height, model.tex_width, model.tex_nchannel)
-    return list(zip(*(column.tolist() for column in columns), strict=True))
