@@ -82,8 +82,10 @@ class Simulator(Environment):
 
     def __init__(self, task: Task, files: SceneFiles | None = None):
         fixed_machine_code()
-        arena = () if files is None else (_styles({"floor": files.floor, "wall": files.wall}), files.scene_xml)
-        super().__init__(task, *arena)
+        styles, scene_xml = None, None
+        if files is not None:
+            styles, scene_xml = _styles({"floor": files.floor, "wall": files.wall}), files.scene_xml
+        super().__init__(task, styles, scene_xml, has_images=True)
         self._rewind: _Rewind | None = None
 
     @property

@@ -3,7 +3,7 @@
 import copy
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import lru_cache, partial
 from typing import Any
 
@@ -19,7 +19,9 @@ from pipeline.libero.assets import as_evaluated
 from pipeline.libero.carried import definition_of
 from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
+from pipeline.physics.without_images import images_left_out
 from pipeline.scenes.compiled import fixed_pose, grip_pose, physics_to_read
+from pipeline.scenes.flat_images import restore_images
 from pipeline.types import Floats, Push, Scene, Task
 
 DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -52,14 +54,22 @@ class Environment:
         task: the task, whose BDDL file describes the scene.
         scene_properties: ``floor_style`` and ``wall_style``, if they differ from those of the task's arena.
         scene_xml: absolute path of another file for the arena.
+        has_images: True if the models of its resets have images, to render from.
     """
 
-    def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
+    def __init__(
+        self,
+        task: Task,
+        scene_properties: Mapping[str, str] | None = None,
+        scene_xml: str | None = None,
+        has_images: bool = False,
+    ):
         self.task = task
         unseen = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
         arena = {"scene_properties": scene_properties, "scene_xml": scene_xml}
         build = partial(control_env(), bddl_file_name=str(task.bddl_file), ignore_done=True, **unseen, **arena)
-        with seeded(0):
+        self._has_images = has_images
+        with seeded(0), nullcontext() if has_images else images_left_out():
             self._env = until_placed(build, task)
         self._control_step = ControlStep(self._env.env)
         self._goal = definition_of(task).goal if task.goal_file else ()
@@ -109,6 +119,8 @@ class Environment:
     def _as_mjcf(self) -> str:
         """Return the scene that LIBERO's last reset compiled as MJCF, with the masses of an evaluation."""
         scene = ET.fromstring(self._env.sim.model.get_xml())
+        if not self._has_images:
+            restore_images(scene, self._env.env.image_files)
         as_evaluated(scene)
         return ET.tostring(scene, encoding="unicode")
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rotations import axis_angle
+from pipeline.scenes.flat_images import flat_images
 from pipeline.types import Floats, Scene, State
 
 Joints = NDArray[np.intp]
@@ -43,9 +44,7 @@ def physics_to_read(model_xml: str) -> mujoco.MjModel:
         ValueError: when MuJoCo rejects the scene.
     """
     scene = ET.fromstring(model_xml)
-    for texture in scene.iterfind("asset/texture[@name][@file]"):
-        del texture.attrib["file"]
-        texture.attrib.update(builtin="flat", width="1", height="1")
+    flat_images(scene)
     return compiled(ET.tostring(scene, encoding="unicode"))
 
 

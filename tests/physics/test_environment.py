@@ -1,7 +1,9 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 
+import arenas
 import mujoco
 import numpy as np
 import pytest
@@ -92,6 +94,20 @@ def test_only_pictures_are_left_out_of_the_model(stove: Environment, whole: dict
     arrays = {name for name in set(dir(recorded)) - others if isinstance(getattr(recorded, name), np.ndarray)}
     assert {"body_mass", "geom_size", "mesh_vert", "mat_rgba", "jnt_range"} < arrays
     assert [name for name in sorted(arrays) if not np.array_equal(getattr(ours, name), getattr(recorded, name))] == []
+
+
+@pytest.mark.parametrize("arena", arenas.TASKS)
+def test_resets_without_images_write_the_same_scenes(arena: str) -> None:
+    with (
+        closing(Environment(arenas.TASKS[arena])) as ours,
+        closing(Environment(arenas.TASKS[arena], has_images=True)) as libero,
+    ):
+        assert ours.place_fixtures(4) == libero.place_fixtures(4)
+        assert ours.reset(5) == libero.reset(5)
+        assert np.array_equal(ours.state, libero.state)
+        ours_mb, libero_mb = (env.sim.model._model.ntexdata / 2**20 for env in (ours, libero))
+        assert libero_mb > 30
+        assert ours_mb < 6, "only the sky and the table's plain colour are left"
 
 
 def test_what_mujoco_resets_by_itself_is_unstable(stove: Environment, whole: dict[Task, Trajectory]) -> None:
