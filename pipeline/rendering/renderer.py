@@ -81,23 +81,29 @@ class Renderer:
         for perturbation in perturbations:
             fields.update(perturbation.fields)
         former = {name: getattr(self.model, name).copy() for name in fields}
-        textures: list[int] = []
+        textures: dict[int, NDArray[np.uint8]] = {}
         try:
             for perturbation in perturbations:
                 perturbation.apply(self.model)
             if "tex_data" in former:
-                texel_pairs = zip(texels(self.model), texels(self.model, former["tex_data"]), strict=True)
-                for texture, (perturbed, unperturbed) in enumerate(texel_pairs):
-                    if not np.array_equal(perturbed, unperturbed):
-                        textures.append(texture)
-            self.drawing.load(textures)
+                # All textures take 180 MB, and a perturbation changes few of them.
+                textures = self._unlike(former["tex_data"])
+                del former["tex_data"]
+            self.drawing.load(textures.keys())
             self._perturbations = tuple(perturbations)
             yield
         finally:
             self._perturbations = outer
             for name, values in former.items():
                 getattr(self.model, name)[:] = values
-            self.drawing.load(textures)
+            for texture, values in textures.items():
+                texels(self.model)[texture][:] = values
+            self.drawing.load(textures.keys())
+
+    def _unlike(self, former: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
+        """Return a copy of each texture of a former ``tex_data`` that differs from the model's texture now."""
+        pairs = zip(texels(self.model), texels(self.model, former), strict=True)
+        return {number: before.copy() for number, (now, before) in enumerate(pairs) if not np.array_equal(now, before)}
 
     def close(self) -> None:
         self.drawing.close()
