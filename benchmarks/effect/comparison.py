@@ -9,6 +9,7 @@ from typing import Any
 from instructions import at_own_place
 from results import PolicyResults, read
 
+from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult, Trial
 from pipeline.evaluation.statistics import Pair, compare, paired, success_rate, wilson
 from pipeline.files import replaced, write
@@ -21,7 +22,7 @@ LOG = Path(__file__).resolve().parents[1] / "LOG.md"
 FURTHER = Path(__file__).with_name("further") / "results"
 """Folder with one subfolder of results for each further experiment."""
 
-BESIDE = {"starts": "no_state", "goals_many": "goals"}
+BESIDE = {"starts": "no_state", "goals_many": "goals", "axes_relative": "axes"}
 """Further experiment to a second one whose arms join its table: both share policies, tests and demonstrations."""
 
 LINES = {
@@ -94,6 +95,9 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
     Episodes are paired by seed. Test tasks are resampled within the tasks of the scene, each with all seeds.
     ``p_value`` is the larger p-value of resampling and of ``sign_flip``, as resampling is unreliable if few tests
     differ. ``holm`` is the p-value by Holm (1979) over the lines of the two arms.
+
+    Raises:
+        PipelineError: when two arms have different tests.
     """
     compared: list[dict[str, Any]] = []
     for first, second in combinations(arms_of(results), 2):
@@ -104,7 +108,13 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
             pairs: list[Pair] = []
             for seed in sorted(seeds):
                 pairs += paired(episodes[first][seed], episodes[second][seed])
-            assert len(pairs) == sum(len(episodes[first][seed]) for seed in seeds), "all arms have equal tests"
+            episodes_of_first = sum(len(episodes[first][seed]) for seed in seeds)
+            if len(pairs) != episodes_of_first:
+                raise PipelineError(
+                    f"{second} has {len(pairs)} of the {episodes_of_first} tests of {first} on {LINES[line]}",
+                    expected="equal tests in the results of all arms",
+                    remedy="evaluate both arms again with one configuration",
+                )
             if pairs:
                 measured = compare(pairs)["all"]["difference"]
                 p_value = max(measured["p_value"] or 0.0, sign_flip(pairs))
