@@ -18,10 +18,8 @@ from pathlib import Path
 
 import psutil
 
-STAGES = (
-    *("inputs", "doctor", "plan", "leakage", "replay", "render", "exports", "manifest", "validate", "recipe"),
-    *("summary", "card", "report"),
-)
+FIRST_STAGES = ("inputs", "doctor", "plan", "leakage", "replay", "render", "exports", "manifest")
+LAST_STAGES = ("validate", "recipe", "summary", "card", "report")
 EVERY_S = 0.3
 
 
@@ -32,7 +30,7 @@ def main() -> None:
     arguments = parser.parse_args()
     clones: Sequence[Path] = arguments.clones
     report: dict[str, dict[str, dict[str, float]]] = {str(clone): {} for clone in clones}
-    for stage in STAGES:
+    for stage in (*FIRST_STAGES, *LAST_STAGES):
         for clone in clones:
             report[str(clone)][stage] = measured(clone, stage, arguments.config)
             print(clone, stage, report[str(clone)][stage], file=sys.stderr)

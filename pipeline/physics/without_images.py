@@ -16,6 +16,7 @@ from pipeline.scenes.flat_images import flat_images
 def images_left_out() -> Iterator[None]:
     """Let LIBERO's environments that are created in this context compile all their scenes without images.
 
+    LIBERO's table of classes changes meanwhile, so only one thread may create environments.
     Such an environment has an attribute ``image_files``, the result of ``flat_images`` for its last compiled scene.
     """
     from libero.libero.envs.bddl_base_domain import TASK_MAPPING
@@ -34,14 +35,9 @@ def _without_images(problem: Any) -> Any:
 
     class WithoutImages(problem):  # type: ignore[misc]
         def _initialize_sim(self, xml_string: str | None = None) -> None:
-            # robosuite's constructor unsets the processor and then compiles.
-            self.set_xml_processor(self._leave_images_out)
-            super()._initialize_sim(xml_string)
-
-        def _leave_images_out(self, xml: str) -> str:
-            scene = ET.fromstring(xml)
+            scene = ET.fromstring(xml_string or self.model.get_xml())
             self.image_files = flat_images(scene)
-            return ET.tostring(scene, encoding="unicode")
+            super()._initialize_sim(ET.tostring(scene, encoding="unicode"))
 
     # LIBERO compares the name of the class with the problem's name.
     WithoutImages.__name__ = problem.__name__

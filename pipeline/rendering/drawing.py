@@ -97,9 +97,9 @@ class PlainDrawing:
         return False
 
     def release(self) -> None:
-        """Drop the reference to the model, so that its memory can be freed; only ``adopt`` or ``close`` may follow.
+        """Drop the reference to the model, so that its memory can be freed.
 
-        Only an object that ``adopts`` has this method's use.
+        Call it only if ``adopts`` is true. Only ``adopt`` or ``close`` may follow.
         """
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:

@@ -86,8 +86,8 @@ class Renderer:
             for perturbation in perturbations:
                 perturbation.apply(self.model)
             if "tex_data" in former:
-                # All textures take 180 MB, and a perturbation changes few of them.
-                textures = self._unlike(former["tex_data"])
+                # All textures take up to 190 MB, and a perturbation changes few of them.
+                textures = self._replaced_textures(former["tex_data"])
                 del former["tex_data"]
             self.drawing.load(textures.keys())
             self._perturbations = tuple(perturbations)
@@ -100,7 +100,7 @@ class Renderer:
                 texels(self.model)[texture][:] = values
             self.drawing.load(textures.keys())
 
-    def _unlike(self, former: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
+    def _replaced_textures(self, former: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
         """Return a copy of each texture of a former ``tex_data`` that differs from the model's texture now."""
         pairs = zip(texels(self.model), texels(self.model, former), strict=True)
         return {number: before.copy() for number, (now, before) in enumerate(pairs) if not np.array_equal(now, before)}
@@ -124,7 +124,8 @@ class LastScene:
     def renderer(self, scene: str | mujoco.MjModel, size_px: int = SIZE_PX) -> Renderer:
         """Return the renderer of a scene.
 
-        A request for another scene or size makes the returned renderer unusable. After an error, no scene is open.
+        A request for another scene or size makes the returned renderer unusable, so leave ``Renderer.perturbed``
+        before. After an error, no scene is open.
 
         Args:
             scene: the scene's MJCF, or a compiled model, which must not change while its renderer is used.
@@ -140,7 +141,7 @@ class LastScene:
             return self._renderer
         try:
             if self._drawing is not None and has_size and self._drawing.adopts:
-                # A model takes 200 MB; the former model is freed before the next one is compiled.
+                # A model takes 200 to 300 MB; the former model is freed before the next one is compiled.
                 self._renderer = self._scene = None
                 self._drawing.release()
             else:

@@ -134,6 +134,22 @@ def test_a_scene_after_one_that_failed_half_way_is_shown_as_it_is(tmp_path: Path
         assert np.array_equal(renderer.frame("agentview"), expected)
 
 
+@pytest.mark.parametrize("size_px", [96, 256, 512])
+def test_frames_of_every_size_share_a_context(size_px: int, tmp_path: Path) -> None:
+    image = tmp_path / "image.png"
+    cv2.imwrite(str(image), np.arange(192, dtype=np.uint8).reshape(8, 8, 3))
+    with closing(LastScene()) as opened:
+        first = opened.renderer(painted("box", image), size_px).drawing
+        renderer = opened.renderer(painted("sphere", image), size_px)
+        assert renderer.drawing is first
+        mujoco.mj_forward(renderer.model, renderer.data)
+        frame = renderer.frame("agentview")
+    with closing(Renderer(painted("sphere", image), size_px=size_px)) as alone:
+        mujoco.mj_forward(alone.model, alone.data)
+        assert np.array_equal(frame, alone.frame("agentview"))
+        assert frame.shape == (size_px, size_px, 3)
+
+
 LEFT_OPEN = '''
 from pipeline.rendering.renderer import LastScene
 

@@ -100,16 +100,15 @@ class SoftwareDrawing(PlainDrawing):
 
     def __init__(self, model: mujoco.MjModel, size_px: int = SIZE_PX):
         # Create the context for the common parts of all scenes, and then switch it to this model.
-        self._bare = private.bare(model)
+        self._bare, self._fixed = private.bare(model), private.fixed(model)
         super().__init__(self._bare, size_px)
         with ExitStack() as undo:
             undo.callback(self.close)
             self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
             self._textures = private.textures_of(self._bare)
             self._meshes = Meshes(self._context, self._bare, [])
-            self._skinned = SkinnedMeshes(
-                self._skins, self._samples, self._meshes, np.zeros(self._bare.ngeom, np.bool_)
-            )
+            nothing = np.zeros(self._bare.ngeom, np.bool_)
+            self._skinned = SkinnedMeshes(self._skins, self._samples, self._bare, self._meshes, nothing)
             self._still: dict[str, Still] = {}
             self._underlays: dict[str, Underlay] = {}
             self._show(model)
@@ -127,7 +126,7 @@ class SoftwareDrawing(PlainDrawing):
 
     def adopt(self, model: mujoco.MjModel) -> bool:
         """Switch to another model in this context if possible, and return whether it was."""
-        if not self.possible(model) or private.fixed(model) != private.fixed(self._model):
+        if not self.possible(model) or private.fixed(model) != self._fixed:
             return False
         self._gl.make_current()
         self._show(model)
@@ -135,7 +134,7 @@ class SoftwareDrawing(PlainDrawing):
 
     def release(self) -> None:
         """Drop the reference to the model; the context keeps its meshes and textures."""
-        self._model = self._meshes.model = self._bare
+        self._model = self._bare
         del self._culling
 
     def _show(self, model: mujoco.MjModel) -> None:
@@ -150,7 +149,7 @@ class SoftwareDrawing(PlainDrawing):
         rendered = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
         self._meshes = Meshes(self._context, model, rendered, self._meshes)
         by_faces = shown & self.chooses_faces
-        self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, by_faces, self._skinned)
+        self._skinned = SkinnedMeshes(self._skins, self._samples, model, self._meshes, by_faces, self._skinned)
         self._forget_underlays()
 
     def load(self, textures: Collection[int]) -> None:

@@ -23,7 +23,8 @@ class SkinnedMeshes:
     Args:
         skins: the context's skins.
         samples: (SAMPLES, 2) place of each sample in its pixel.
-        meshes: the display lists of the model's meshes.
+        model: the model.
+        meshes: the display lists of its meshes.
         shown: (ngeom,) geoms that can be rendered, and whose faces may be chosen.
         former: the ``SkinnedMeshes`` of the context's former model; its faces are reused.
     """
@@ -32,11 +33,12 @@ class SkinnedMeshes:
         self,
         skins: Skins,
         samples: NDArray[np.float32],
+        model: mujoco.MjModel,
         meshes: Meshes,
         shown: NDArray[np.bool_],
         former: SkinnedMeshes | None = None,
     ):
-        self._skins, self._samples, self._meshes, model = skins, samples, meshes, meshes.model
+        self._skins, self._samples, self._meshes = skins, samples, meshes
         self._mesh = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
         self._skin: NDArray[np.intp] = np.full(model.ngeom, -1, np.intp)
         self._faces: dict[bytes, Faces] = {}

@@ -77,7 +77,7 @@ class Texture(NamedTuple):
         digest: hash of the texels.
     """
 
-    kind: tuple[int, int, int, int]
+    kind: tuple[int, ...]
     digest: bytes
 
 
@@ -89,8 +89,9 @@ def textures_of(model: mujoco.MjModel) -> list[Texture]:
 def texture_of(model: mujoco.MjModel, number: int) -> Texture:
     """Return the identity of a model's texture."""
     columns = (model.tex_type, model.tex_height, model.tex_width, model.tex_nchannel)
-    kind, height_px, width_px, channels = (int(column[number]) for column in columns)
-    return Texture((kind, height_px, width_px, channels), hashlib.sha256(texels(model)[number].data).digest())
+    return Texture(
+        tuple(int(column[number]) for column in columns), hashlib.sha256(texels(model)[number].data).digest()
+    )
 
 
 def adopt_textures(
@@ -98,7 +99,7 @@ def adopt_textures(
 ) -> None:
     """Replace a former model's textures in a context by a model's textures.
 
-    Textures that both models have stay in the context: a scene has 140 MB of textures.
+    Textures that both models have stay in the context: a scene has up to 190 MB of textures.
 
     Args:
         context: the context.

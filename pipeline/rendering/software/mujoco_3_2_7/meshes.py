@@ -44,7 +44,6 @@ class Meshes:
     OpenGL's stack. An extra mesh after the skin, the closing mesh, pops the matrix.
 
     Attributes:
-        model: the meshes' model.
         closing: (nmesh,) number, as MuJoCo numbers meshes, of the closing mesh of each mesh that is rendered.
         contents: number of each rendered mesh to the hash of its content.
 
@@ -59,7 +58,7 @@ class Meshes:
     def __init__(
         self, context: mujoco.MjrContext, model: mujoco.MjModel, rendered: Sequence[int], former: Meshes | None = None
     ):
-        self.model, self._context, self._meshes = model, context, rendered
+        self._context, self._meshes = context, rendered
         self._of_geom = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
         kept = former._give_up() if former else {}
         calls().glDeleteLists(context.baseMesh, context.rangeMesh)
