@@ -20,7 +20,7 @@ import psutil
 
 FIRST_STAGES = ("inputs", "doctor", "plan", "leakage", "replay", "render", "exports", "manifest")
 LAST_STAGES = ("validate", "recipe", "summary", "card", "report")
-EVERY_S = 0.3
+EVERY_S = 1.0
 
 
 def main() -> None:

