@@ -17,9 +17,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import psutil
+from disk import STAGES
 
-FIRST_STAGES = ("inputs", "doctor", "plan", "leakage", "replay", "render", "exports", "manifest")
-LAST_STAGES = ("validate", "recipe", "summary", "card", "report")
 EVERY_S = 1.0
 
 
@@ -30,7 +29,7 @@ def main() -> None:
     arguments = parser.parse_args()
     clones: Sequence[Path] = arguments.clones
     report: dict[str, dict[str, dict[str, float]]] = {str(clone): {} for clone in clones}
-    for stage in (*FIRST_STAGES, *LAST_STAGES):
+    for stage in (*STAGES, "recipe", "summary", "card", "report"):
         for clone in clones:
             report[str(clone)][stage] = measured(clone, stage, arguments.config)
             print(clone, stage, report[str(clone)][stage], file=sys.stderr)

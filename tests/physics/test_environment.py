@@ -96,6 +96,7 @@ def test_only_pictures_are_left_out_of_the_model(stove: Environment, whole: dict
     assert [name for name in sorted(arrays) if not np.array_equal(getattr(ours, name), getattr(recorded, name))] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arena", arenas.TASKS)
 def test_resets_without_images_write_the_same_scenes(arena: str) -> None:
     with (
