@@ -107,14 +107,8 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
             seeds = episodes[first].keys() & episodes[second].keys()
             pairs: list[Pair] = []
             for seed in sorted(seeds):
+                _refuse_different_tests((first, second), [episodes[arm][seed] for arm in (first, second)], line)
                 pairs += paired(episodes[first][seed], episodes[second][seed])
-            episodes_of_first = sum(len(episodes[first][seed]) for seed in seeds)
-            if len(pairs) != episodes_of_first:
-                raise PipelineError(
-                    f"{second} has {len(pairs)} of the {episodes_of_first} tests of {first} on {LINES[line]}",
-                    expected="equal tests in the results of all arms",
-                    remedy="evaluate both arms again with one configuration",
-                )
             if pairs:
                 measured = compare(pairs)["all"]["difference"]
                 p_value = max(measured["p_value"] or 0.0, sign_flip(pairs))
@@ -122,6 +116,19 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
         adjusted = holm([difference["p_value"] for difference in lines])
         compared += [{**difference, "holm": p_value} for difference, p_value in zip(lines, adjusted, strict=True)]
     return compared
+
+
+def _refuse_different_tests(arms: tuple[str, str], episodes: Sequence[Sequence[EpisodeResult]], line: str) -> None:
+    """Raise a ``PipelineError`` if the episodes of two arms on a line do not belong to the same tests."""
+    tests_of_first, tests_of_second = ({row.trial for row in rows} for rows in episodes)
+    if tests_of_first != tests_of_second:
+        first, second = arms
+        raise PipelineError(
+            f"{first} and {second} have different tests on {LINES[line]}: {len(tests_of_first)} and "
+            f"{len(tests_of_second)}, of which {len(tests_of_first & tests_of_second)} are equal",
+            expected="equal tests in the results of all arms",
+            remedy="evaluate both arms again with one configuration",
+        )
 
 
 def sign_flip(pairs: Sequence[Pair]) -> float:
