@@ -156,10 +156,10 @@ class Work:
         import evaluation
 
         rows: list[plan.Row] = []
-        for arm in self.experiment.arms:
+        for arm in self.experiment.every_arm:
             self.make_data(arm)
             rows += episodes.perturbed_rows(self.dataset(arm))
-        names = [self.experiment.dataset_name(arm) for arm in self.experiment.arms]
+        names = [self.experiment.dataset_name(arm) for arm in self.experiment.every_arm]
         config = self.out / f"all_arms_{digest(names)[:8]}.yaml"
         sections = self.experiment.run.model_dump(mode="json", include={"demos", "plan"}, exclude_defaults=True)
         write(config, yaml.safe_dump({"name": config.stem, "folder": str(self.out), **sections}))

@@ -5,6 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -81,10 +82,11 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
             Replays(run.demos, run.replay, trajectories, workers, run.filter).complete(rows, rejected)
             outcome = selection.select(chosen, verdicts_of(trajectories.rows(), chosen, run.filter), rejected)
             kept = [row for row in chosen if outcome[row.episode_id].kept]
-            if len(kept) < experiment.episodes:
+            wanted = experiment.episodes_of(arm)
+            if len(kept) < wanted:
                 counts = Counter(row.axis for row in chosen if row.wanted) - Counter(row.axis for row in kept)
                 raise PipelineError(
-                    f"{len(kept)} of {experiment.episodes} episodes of {arm} are kept; missing are {dict(counts)}",
+                    f"{len(kept)} of {wanted} episodes of {arm} are kept; missing are {dict(counts)}",
                     where=experiment.data,
                     expected="an equal number in all arms",
                     remedy="raise plan.reserve for perturbed episodes, or spare in the experiment for clean ones",
@@ -96,7 +98,8 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
 def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tuple[list[plan.Row], list[plan.Row]]:
     """Plan an arm with one episode per demonstration; return all rows, and the rows that the arm may use.
 
-    All other rows are the clean twins of demonstrations with perturbed episodes.
+    All other rows are the clean twins of demonstrations with perturbed episodes. Arms of ``further`` also get the
+    perturbed episodes of their runs.
 
     Raises:
         PipelineError: if a task has fewer demonstrations than wanted.
@@ -112,7 +115,7 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
                 remedy="choose another task, or lower demonstrations in the experiment",
             )
     wanted, rows, begin = experiment.run.plan, [], 0
-    for name in experiment.arms[arm]:
+    for name in experiment.mixtures(arm):
         end = begin + wanted.episodes[name] // len(by_task)
         axes = wanted.axes.model_copy(update=dict.fromkeys(wanted.axes.configured().keys() - axes_of(name)))
         config = PlanConfig(seed=wanted.seed, axes=axes, episodes={name: wanted.episodes[name]}, reserve=wanted.reserve)
@@ -127,7 +130,17 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
         for row in plan.twins(by_task[task][begin:], wanted.seed, experiment.run.replay):
             rank = begin + row.rank
             clean.append(replace(row, rank=rank, wanted=rank < experiment.demonstrations))
-    return rows + clean, [row for row in rows if row.role == "perturbed"] + clean
+    chosen = [row for row in rows if row.role == "perturbed"] + clean
+    further = _further(experiment, arm, list(chain.from_iterable(by_task[task] for task in experiment.tasks)))
+    return rows + clean + further, chosen + further
+
+
+def _further(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> list[plan.Row]:
+    """Plan the perturbed episodes of an arm's run; an empty list for an arm without one."""
+    if arm not in experiment.further:
+        return []
+    run = experiment.further[arm].config
+    return [row for row in plan.make(demos, run.plan, run.replay, benchmark.load()) if row.role == "perturbed"]
 
 
 def perturbed_rows(file: Path) -> list[plan.Row]:

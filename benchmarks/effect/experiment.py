@@ -76,6 +76,27 @@ class EvaluationConfig(Frozen):
         )
 
 
+class FurtherEpisodes(Frozen):
+    """An arm's episodes, and the perturbed episodes of a run.
+
+    Attributes:
+        arm: arm whose episodes come first.
+        run: configuration of the run. It selects the same demonstrations as the run of the experiment.
+    """
+
+    arm: str
+    run: Path
+
+    @cached_property
+    def config(self) -> Config:
+        return load(self.run)
+
+    @property
+    def episodes(self) -> int:
+        """Return the number of planned episodes of the run."""
+        return sum(self.config.plan.episodes.values())
+
+
 class Experiment(Frozen):
     """Settings of the whole experiment.
 
@@ -85,6 +106,7 @@ class Experiment(Frozen):
         spare: additional demonstrations from ``demos expand``, as some clean replays fail.
         arms: arm to the names of its perturbations in the run's ``plan.episodes``. All other arms are compared with the
             first one.
+        further: additional arm to its episodes.
         frame_px: height and width of the frames that policies see.
         policy: options of lerobot's ACT.
         seeds: training seeds; one policy of each arm is trained with each seed.
@@ -95,6 +117,7 @@ class Experiment(Frozen):
     demonstrations: int = Field(ge=1)
     spare: int = Field(default=0, ge=0)
     arms: dict[str, tuple[str, ...]] = Field(min_length=1)
+    further: dict[str, FurtherEpisodes] = Field(default_factory=dict)
     seeds: tuple[int, ...] = Field(min_length=1)
     frame_px: int = Field(ge=32, le=256)
     policy: dict[str, Any]
@@ -131,6 +154,15 @@ class Experiment(Frozen):
                     f"{arm} has {perturbed} perturbed of {self.episodes} episodes; a third must stay clean: lower "
                     f"plan.episodes in {self.data}, or raise demonstrations"
                 )
+        for arm, further in self.further.items():
+            if arm in self.arms:
+                raise ValueError(f"{arm} is an arm of `arms` and of `further`")
+            if further.arm not in self.arms:
+                raise ValueError(f"{arm} adds episodes to an unknown arm {further.arm!r}")
+            if further.config.demos != self.run.demos:
+                raise ValueError(f"{further.run} and {self.data} differ in demos")
+            if further.config.plan.seed == self.run.plan.seed:
+                raise ValueError(f"{further.run} and {self.data} have the same plan.seed, which repeats episodes")
         wanted = self.evaluation.episodes(self.tasks)
         if wanted > MOST_EPISODES:
             raise ValueError(f"{wanted} episodes of evaluation, expected at most {MOST_EPISODES}")
@@ -147,13 +179,25 @@ class Experiment(Frozen):
 
     @property
     def episodes(self) -> int:
-        """Return the number of episodes of each arm."""
+        """Return the number of episodes of each of ``arms``."""
         return self.demonstrations * len(self.tasks)
+
+    @property
+    def every_arm(self) -> tuple[str, ...]:
+        """Return the names of all arms."""
+        return (*self.arms, *self.further)
+
+    def episodes_of(self, arm: str) -> int:
+        """Return the number of episodes of an arm."""
+        return self.episodes + (self.further[arm].episodes if arm in self.further else 0)
 
     def dataset_name(self, arm: str) -> str:
         """Return a dataset's name, which contains a digest of all settings that the dataset depends on."""
-        run = self.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"}, by_alias=True)
-        return f"{arm}_{digest(run, self.demonstrations, self.spare, self._names(arm), self.frame_px)[:8]}"
+        run = _episode_settings(self.run)
+        settings: list[Any] = [run, self.demonstrations, self.spare, self.mixtures(arm), self.frame_px]
+        if arm in self.further:
+            settings.append(_episode_settings(self.further[arm].config))
+        return f"{arm}_{digest(*settings)[:8]}"
 
     def policy_name(self, arm: str, seed: int) -> str:
         """Return a policy's name, which contains a digest of all settings that the policy depends on.
@@ -166,17 +210,27 @@ class Experiment(Frozen):
         training = self.training.model_dump(exclude={"save_every"}, exclude_defaults=True)
         return f"{arm}_seed{seed}_{digest(self.dataset_name(arm), self.policy, training, seed)[:8]}"
 
-    def _names(self, arm: str) -> tuple[str, ...]:
-        if arm not in self.arms:
-            raise PipelineError(f"no arm {arm!r}", where="arms", expected=" or ".join(self.arms))
-        return self.arms[arm]
+    def mixtures(self, arm: str) -> tuple[str, ...]:
+        """Return the perturbations that an arm has from the run of the experiment.
+
+        Raises:
+            PipelineError: if the experiment does not have the arm.
+        """
+        if arm not in self.every_arm:
+            raise PipelineError(f"no arm {arm!r}", where="arms", expected=" or ".join(self.every_arm))
+        return self.arms[self.further[arm].arm if arm in self.further else arm]
+
+
+def _episode_settings(run: Config) -> dict[str, Any]:
+    """Return the settings of a run that its episodes depend on."""
+    return run.model_dump(mode="json", include={"demos", "plan", "replay", "render"}, by_alias=True)
 
 
 def read(path: Path) -> Experiment:
     """Read and validate the experiment.
 
     A file with a ``base``, another file, has only the differences from it. Its sections are merged with those of the
-    base, but ``arms`` replaces the base's arms.
+    base, but ``arms`` and ``further`` replace those of the base.
 
     Raises:
         PipelineError: names the file and every invalid field.
@@ -199,6 +253,6 @@ def _with_base(path: Path) -> Any:
     settings_of_base = _with_base(path.parent / base)
     sections: dict[str, Any] = {}
     for name, section in settings.items():
-        if isinstance(section, dict) and name != "arms":
+        if isinstance(section, dict) and name not in ("arms", "further"):
             sections[name] = settings_of_base.get(name, {}) | section
     return settings_of_base | settings | sections

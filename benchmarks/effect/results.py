@@ -96,5 +96,6 @@ def read(folder: Path) -> list[PolicyResults]:
                 )
     if not policies:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")
-    arms = list(policies[0].settings["arms"])
+    settings = policies[0].settings
+    arms = [*settings["arms"], *settings.get("further", ())]
     return sorted(policies, key=lambda policy: (arms.index(policy.arm), policy.seed))

@@ -270,6 +270,48 @@ def test_each_demonstration_gives_an_arm_one_episode(arm: str, shipped: Experime
     assert {name: sum(row.axis == name for row in shown) for name in planned} == planned
 
 
+def test_further_episodes_join_those_of_an_arm(tmp_path: Path, shipped: Experiment) -> None:
+    """Tasks get episodes by their weights; the arm's own episodes stay."""
+    experiment = with_further(tmp_path, {"seed": 1, "episodes": {"camera": 8, "noise": 16}})
+    demos = demonstrations(experiment, 54)
+    rows, chosen = episodes.planned(experiment, "more", demos)
+    rows_of_arm, chosen_of_arm = episodes.planned(experiment, "ours", demos)
+    further = [row for row in chosen if row not in chosen_of_arm]
+    assert chosen == chosen_of_arm + further
+    assert rows == rows_of_arm + further
+    assert len({row.episode_id for row in rows}) == len(rows)
+    assert Counter(row.axis for row in further if row.wanted) == {"camera": 8, "noise": 16}
+    assert Counter(row.task for row in further if row.wanted)["turn_on_the_stove"] == 2 * (2 + 4)
+    assert experiment.episodes_of("more") == 224 == sum(row.wanted for row in chosen)
+    assert experiment.dataset_name("ours") == shipped.dataset_name("ours")
+    assert experiment.dataset_name("more") not in map(experiment.dataset_name, experiment.arms)
+
+
+@pytest.mark.parametrize(
+    ("plan", "further", "message"),
+    [
+        ({"seed": 20261125}, {}, "have the same plan.seed, which repeats episodes"),
+        ({}, {"arm": "other"}, "more adds episodes to an unknown arm 'other'"),
+    ],
+)
+def test_further_episodes_that_do_not_fit_are_refused(
+    plan: dict[str, Any], further: dict[str, str], message: str, tmp_path: Path, shipped: Experiment
+) -> None:
+    with pytest.raises(PipelineError, match=message):
+        with_further(tmp_path, {"seed": 1, "episodes": {"noise": 8}} | plan, further)
+
+
+def with_further(folder: Path, plan: dict[str, Any], further: dict[str, str] | None = None) -> Experiment:
+    """Return the shipped experiment with an arm of the episodes of ``ours`` and of a run with this plan."""
+    run = yaml.safe_load((EFFECT / "data.yaml").read_text()) | {"name": "more"}
+    weights = {f"{STOVE.suite}/{STOVE.name}": 3.0}
+    (folder / "more.yaml").write_text(yaml.safe_dump(run | {"plan": {"task_weights": weights} | plan}))
+    arm = {"arm": "ours", "run": str(folder / "more.yaml")} | (further or {})
+    file = folder / "experiment.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(SHIPPED.read_text()) | {"further": {"more": arm}}))
+    return read(file)
+
+
 def test_too_few_demonstrations_are_refused(shipped: Experiment) -> None:
     with pytest.raises(PipelineError, match="49 demonstrations of libero_goal/turn_on_the_stove, not 50"):
         episodes.planned(shipped, "ours", demonstrations(shipped, 49))
@@ -282,10 +324,13 @@ def small(folder: Path, demos: Path) -> Path:
     run["plan"] = {"seed": 7, "axes": {"noise": {}}, "episodes": {"noise": 1}}
     run["export"] = {}
     (folder / "data.yaml").write_text(yaml.safe_dump(run))
+    run["plan"] |= {"seed": 8}
+    (folder / "more.yaml").write_text(yaml.safe_dump(run))
     settings = {
         "data": "data.yaml",
         "demonstrations": 1,
         "arms": {"clean": []},
+        "further": {"more": {"arm": "clean", "run": "more.yaml"}},
         "seeds": [0],
         "frame_px": 32,
         "policy": {
@@ -419,7 +464,7 @@ def test_from_demonstrations_to_the_results(
     monkeypatch.setattr(evaluation, "ComputeConfig", partial(ComputeConfig, cluster="loop"))
     monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 50)
     file, kept = small(tmp_path, short_demos), tmp_path / "results"
-    words = ["effect", "--experiment", str(file), "--results", str(kept), "evaluate", "clean", "0"]
+    words = ["effect", "--experiment", str(file), "--results", str(kept), "evaluate", "more", "0"]
     monkeypatch.setattr(sys, "argv", words)
     command.main()
     (found,) = results.read(kept)
@@ -431,4 +476,4 @@ def test_from_demonstrations_to_the_results(
         (49, "", None, 50),
     ]
     assert found.black == [{"task": STOVE.name, "state": 0, "success": False}]
-    assert found.made["episodes_by_axis"] == {"clean": 1}
+    assert found.made["episodes_by_axis"] == {"clean": 1, "noise": 1}
