@@ -52,7 +52,8 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
-    assert further.keys() == {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes", "axes_relative"}
+    names = {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes", "axes_relative", "object", "spatial"}
+    assert further.keys() == names
     axes, relative = further.pop("axes"), further.pop("axes_relative")
     assert relative == axes.model_copy(update={"arms": relative.arms, "training": relative.training})
     assert relative.training == axes.training.model_copy(update={"proprioception": "relative"})
@@ -67,6 +68,15 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
         "joint": 212,
         "all": 212,
     }
+    groups = [further.pop("object"), further.pop("spatial")]
+    for group in groups:
+        assert group.arms == {"clean": (), "all": axes.arms["all"]}
+        assert planned_perturbed(group, "all") == 128
+        assert (group.policy, group.evaluation) == (axes.policy, groups[0].evaluation)
+        assert group.training == axes.training.model_copy(update={"steps": 8_000})
+        same = {"demos": {"tasks"}}
+        assert group.run.model_dump(exclude=same) == groups[0].run.model_dump(exclude=same)
+    assert [{task.split("/")[0] for task in group.tasks} for group in groups] == [{"libero_object"}, {"libero_spatial"}]
     goals, many = further.pop("goals"), further.pop("goals_many")
     assert many == goals.model_copy(update={"data": many.data, "arms": many.arms, "decisions": many.decisions})
     same = {"plan": {"episodes"}}
