@@ -2,9 +2,11 @@
 
 import inspect
 import json
+import re
 import runpy
 import shlex
 from importlib import import_module
+from importlib.metadata import metadata
 from pathlib import Path
 
 import h5py
@@ -185,6 +187,16 @@ def test_the_evaluation_of_each_trained_policy_is_understood_by_both_programs(tm
         assert options["look_every"] == int(words[words.index("--args.chunk_size") + 1])
     chunk = recipe["training"]["chunk"]["value"]
     assert f"--args.chunk_size {chunk}" in evaluated["openvla_oft"]["server"]
+
+
+@pytest.mark.parametrize("client", ["lerobot_act", "lerobot_smolvla", "lerobot_pi05"])
+def test_pypi_has_the_extras_that_a_client_needs(client: str, tmp_path: Path) -> None:
+    """pip only warns of a missing extra. An extra of lerobot's repository has an address after it."""
+    lerobot = metadata("lerobot")
+    before, since = tiny_recipe(tmp_path)["clients"][client]["where"].split("since lerobot 0.6")
+    text = before if lerobot["Version"].startswith("0.4.") else since
+    named = [extra for names in re.findall(r"lerobot\[([\w,]+)\](?! @)", text) for extra in names.split(",")]
+    assert {*named} <= {*lerobot.get_all("Provides-Extra", [])}
 
 
 def test_openpi_finds_set_and_statistics_by_the_command_of_the_recipe(tmp_path: Path) -> None:
