@@ -33,7 +33,7 @@ Step = Literal["physics", "pixels", "encoding", "evaluation", "checks", "picture
 RECIPES: dict[Step, int] = {
     "physics": 8,
     "pixels": 6,
-    "encoding": 3,
+    "encoding": 4,
     "evaluation": 3,
     "checks": 13,
     "pictures": 9,

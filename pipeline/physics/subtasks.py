@@ -6,7 +6,6 @@ or turn it. A subtask lasts until the next begins, so exactly one subtask is act
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import cycle
 from typing import NamedTuple
 
 import mujoco
@@ -42,11 +41,14 @@ Contacts alone do not suffice: the hand may knock a door shut without contact in
 
 VERBS = {
     "open": ("open", "close"),
-    "close": ("close", "open"),
+    "close": ("open", "close"),
     "turnon": ("turn on", "turn off"),
-    "turnoff": ("turn off", "turn on"),
+    "turnoff": ("turn on", "turn off"),
 }
-"""State to the verbs that bring a thing into this state, and out of it."""
+"""State in the goal to the verbs for a turn of a thing's joint, away from zero and towards zero.
+
+The joints of LIBERO's drawers, doors and knobs are zero where the thing is closed or off.
+"""
 
 
 class _Deed(NamedTuple):
@@ -160,16 +162,16 @@ class _Seen:
         else:
             bodies = np.flatnonzero(self._below(self.model.body(f"{name}_main").id)).tolist()
         thing = called(problem, name)
-        verbs = VERBS[state]
-        if (state, name) in problem.start:
-            verbs = verbs[::-1]
+        away, back = VERBS[state]
         for joint in np.flatnonzero(np.isin(self.model.jnt_bodyid, bodies)):
-            turned = self.qpos[:, self.model.jnt_qposadr[joint]] / np.ptp(self.model.jnt_range[joint])
+            turned = np.abs(self.qpos[:, self.model.jnt_qposadr[joint]]) / np.ptp(self.model.jnt_range[joint])
             touched = self._touch(self._below(self.model.jnt_bodyid[joint]), self.robot)
             moving = np.append(np.abs(np.diff(turned)) >= MOVING, False)
-            turns = [run for run in _runs(touched | moving) if np.ptp(turned[slice(*run)][[0, -1]]) >= TURNED]
-            for (reached, left), verb in zip(turns, cycle(verbs), strict=False):
-                yield _Deed(reached, left, thing, (Subtask(reached, f"{verb} {thing}"),))
+            for reached, left in _runs(touched | moving):
+                change = turned[left - 1] - turned[reached]
+                if abs(change) >= TURNED:
+                    verb = away if change > 0 else back
+                    yield _Deed(reached, left, thing, (Subtask(reached, f"{verb} {thing}"),))
 
     def _below(self, body: int) -> Mask:
         """Return a mask (nbody,) of a body and the bodies that move with it.

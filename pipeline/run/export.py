@@ -152,12 +152,16 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
 def wordings(axis: LanguageAxis | None, suite: str, task: str, perturbations: str) -> tuple[str, ...]:
     """List the rewrites that a language axis may sample for an episode with these perturbations.
 
+    A plan never joins a rewrite with an added object that the rewrite names.
+
     Args:
         axis: `None` for the axis with default ranges.
         perturbations: JSON list, as in the columns of the plan and the manifest.
     """
-    axes = tuple(perturbation.axis for perturbation in from_json(perturbations))
-    return _wordings(axis or LanguageAxis(), task_of(suite, task, perturbations), axes)
+    changes = from_json(perturbations)
+    axes = tuple(change.axis for change in changes)
+    texts = _wordings(axis or LanguageAxis(), task_of(suite, task, perturbations), axes)
+    return tuple(text for text in texts if not any(change.named_in(text) for change in changes))
 
 
 @cache

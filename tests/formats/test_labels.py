@@ -24,6 +24,7 @@ from pipeline.episode_schema import check, labels_of
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Format
 from pipeline.formats.read_back import Copy, Fault
+from pipeline.run.export import wordings
 from pipeline.types import Episode, Subtask
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
@@ -99,3 +100,21 @@ def test_validate_reports_starts_that_no_reader_can_use(starts: list[int], what:
 def test_writers_reject_labels_that_training_would_misread(changes: dict[str, Any], what: str) -> None:
     with pytest.raises(PipelineError, match=what):
         check(replace(episode(IDS[1]), **changes))
+
+
+@pytest.mark.parametrize(
+    ("task", "name", "category", "word"),
+    [
+        ("pick_up_the_salad_dressing_and_place_it_in_the_basket", "libero/wine_bottle", "bottle_of_wine", "bottle"),
+        ("pick_up_the_cream_cheese_and_place_it_in_the_basket", "libero/cookies", "box", "box"),
+        ("pick_up_the_butter_and_place_it_in_the_basket", "libero/moka_pot", "moka_pot", "kettle"),
+    ],
+)
+def test_no_rewrite_names_an_added_object(task: str, name: str, category: str, word: str) -> None:
+    added = {"name": name, "category": category, "sha256": "0" * 64, "licence": "MIT", "attribution": ""}
+    layout = {"axis": "layout", "component": "objects", "level": 1, "objects": [added], "seed": 1}
+    milk = {**layout, "objects": [{**added, "category": "milk"}]}
+    kept, others = (wordings(None, "libero_object", task, json.dumps([change])) for change in (layout, milk))
+    naming = [text for text in others if word in text.split()]
+    assert naming
+    assert [text for text in others if text not in naming] == list(kept)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import BOWL, MILK, PLATE, STOVE, starter_demo
@@ -139,6 +140,46 @@ def test_what_is_never_lifted_is_pushed(done: tuple[Task, Trajectory, Any]) -> N
     own = {*env.objects_dict[name].contact_geoms}
     touched = seen(env, trajectory, lambda: met_by(env, own, is_robots))
     assert np.flatnonzero(touched)[0] == push.step
+
+
+@pytest.mark.parametrize(("backwards", "verb"), [(False, "turn on"), (True, "turn off")])
+def test_a_knob_that_is_released_halfway_is_turned_one_way(
+    whole: dict[Task, Trajectory], backwards: bool, verb: str
+) -> None:
+    """By the angle of the knob; LIBERO's stove is on beyond 0.5 rad, and off at 0."""
+    trajectory = released_halfway(whole[STOVE])
+    if backwards:
+        trajectory = replace(trajectory, states=trajectory.states[::-1], actions=trajectory.actions[::-1])
+    angles_rad = trajectory.states[:, knob(trajectory)]
+    found = subtasks(trajectory, STOVE)
+    turns = [step for step, text in found if not text.startswith("approach ")]
+    assert len(turns) == 2, "once until the hand lets go, and once more"
+    assert [text for _, text in found] == ["approach the stove", f"{verb} the stove"] * 2
+    for begin, end in pairwise([*turns, len(angles_rad) - 1]):
+        assert (angles_rad[end] > angles_rad[begin]) == (not backwards)
+
+
+def knob(trajectory: Trajectory) -> int:
+    """Return the place of the knob's angle in a flattened state, whose first entry is the time."""
+    return 1 + int(compiled(trajectory).joint("flat_stove_1_button").qposadr[0])
+
+
+def compiled(trajectory: Trajectory) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(trajectory.model_xml)
+
+
+def released_halfway(trajectory: Trajectory) -> Trajectory:
+    """Insert 16 steps without action, in which the arm is at its start and the knob halfway."""
+    model = compiled(trajectory)
+    joints = [model.joint(number) for number in range(model.njnt)]
+    robot = [1 + int(joint.qposadr[0]) for joint in joints if joint.name.startswith(("robot0_", "gripper0_"))]
+    angles_rad = trajectory.states[:, knob(trajectory)]
+    halfway = int(np.flatnonzero(angles_rad > angles_rad[-1] / 2)[0])
+    waiting = np.repeat(trajectory.states[halfway : halfway + 1], 16, axis=0)
+    waiting[:, robot] = trajectory.states[0, robot]
+    states = np.concatenate([trajectory.states[:halfway], waiting, trajectory.states[halfway:]])
+    actions = np.insert(trajectory.actions, [halfway] * len(waiting), 0.0, axis=0)
+    return replace(trajectory, states=states, actions=actions)
 
 
 def test_each_task_has_words_for_its_goal() -> None:
