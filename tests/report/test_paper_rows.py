@@ -296,14 +296,61 @@ def test_results_of_vla_evals_own_benchmark_are_read(tmp_path: Path) -> None:
 
 def test_results_of_this_projects_benchmark_in_vla_eval_are_read(tmp_path: Path) -> None:
     (test,) = first_of("libero_spatial", "noise")
-    named = test.suite, test.base, test.name
-    task = EvaluationTask("libero_plus", *named, test.axis, test.component, level_of_test(test), 0)
     settings = {"prompt": "blank", "step_limits": "lerobot"}
-    config = {"benchmark": "pipeline.evaluation.harness:PerturbedLibero", "params": {"settings": settings}}
-    write_vla_eval(tmp_path, config, [(task.for_harness(), {"success": True})])
+    config = {"benchmark": OUR_CLASS, "params": {"settings": settings}}
+    write_vla_eval(tmp_path, config, [(our_task(test), {"success": True})])
     (policy,) = read_tested([tmp_path])
     assert [*policy.outcomes] == [Outcome(test.suite, test.name, True)]
     assert (policy.prompt, dict(policy.step_limits)) == ("blank", {"libero_spatial": (280,)})
+
+
+OUR_CLASS = "pipeline.evaluation.harness:PerturbedLibero"
+
+
+def our_task(test: TestTask) -> dict[str, Any]:
+    """Task of this project's benchmark for vla-eval."""
+    named = test.suite, test.base, test.name
+    return EvaluationTask("libero_plus", *named, test.axis, test.component, level_of_test(test), 0).for_harness()
+
+
+@pytest.mark.parametrize(("max_steps", "limit"), [(50, 50), (9000, 300), (None, 300)])
+def test_a_limit_of_vla_eval_below_the_suites_is_stated(tmp_path: Path, max_steps: int | None, limit: int) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config: dict[str, Any] = {"benchmark": OUR_CLASS, "max_steps": max_steps, "params": {}}
+    write_vla_eval(tmp_path, config, [(our_task(test), {"success": False})])
+    (policy,) = read_tested([tmp_path])
+    assert dict(policy.step_limits) == {"libero_goal": (limit,)}
+
+
+def test_settings_of_another_version_are_named(tmp_path: Path) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config = {"benchmark": OUR_CLASS, "params": {"settings": {"colour": "red"}}}
+    write_vla_eval(tmp_path, config, [(our_task(test), {"success": True})])
+    with pytest.raises(PipelineError, match=r"other settings .*colour"):
+        read_tested([tmp_path])
+
+
+def test_an_episode_without_the_metric_success_is_left_out(tmp_path: Path) -> None:
+    tests = first_of("libero_goal", "robot", 2)
+    config = {"benchmark": THEIR_CLASS, "params": {"suite": "libero_goal"}}
+    file = write_vla_eval(tmp_path, config, [(their_task(test, test.name), {"success": True}) for test in tests])
+    content = json.loads(file.read_text())
+    content["tasks"][0]["episodes"][0]["metrics"] = {}
+    file.write_text(json.dumps(content))
+    (policy,) = read_tested([tmp_path])
+    assert (len(policy.outcomes), policy.left_out) == (1, 1)
+
+
+@pytest.mark.parametrize("further", ["episodes/0.json", "eval_info.json"])
+def test_results_of_two_programs_in_a_folder_are_rejected(tmp_path: Path, further: str) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config = {"benchmark": THEIR_CLASS, "params": {"suite": "libero_goal"}}
+    file = write_vla_eval(tmp_path, config, [(their_task(test, "prompt"), {"success": True})])
+    (tmp_path / further).parent.mkdir(exist_ok=True)
+    (tmp_path / further).write_text("{}")
+    with pytest.raises(PipelineError, match="results of several programs"):
+        read_tested([tmp_path])
+    assert len(read_tested([file])) == 1
 
 
 @pytest.mark.parametrize(
