@@ -118,12 +118,14 @@ class _Episode:
         prompt: kind of the prompt; `None` if the file does not state it.
         step_limit: step limit; `None` if the file does not state it.
         success: whether the episode reached its goal; `None` if it has no outcome.
+        black: views that were black; other programs' own benchmarks have no such setting.
     """
 
     test: TestTask
     prompt: str | None
     step_limit: int | None
     success: bool | None
+    black: str = "none"
 
 
 def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
@@ -236,6 +238,7 @@ def _policy(folder: Path, program: str, episodes: Sequence[_Episode]) -> TestedP
         None if None in prompts else joined(kind for kind in prompts if kind is not None),
         limits_of(limits),
         len(episodes) - len(ended),
+        joined({episode.black for episode in ended}),
     )
 
 
@@ -293,7 +296,8 @@ def _vla_eval_episodes(file: Path) -> list[_Episode]:
                 prompt, step_limit = _kind_of_prompt(test, episode.name), limit or STEP_LIMITS[test.suite]
             ended = not episode.failure_reason and "success" in episode.metrics
             success = bool(episode.metrics["success"]) if ended else None
-            episodes.append(_Episode(test, prompt, step_limit, success))
+            black = "none" if settings is None else settings.black
+            episodes.append(_Episode(test, prompt, step_limit, success, black))
     return episodes
 
 

@@ -31,6 +31,7 @@ class TestedPolicy:
             results do not state it. Several kinds are joined by `` and ``.
         step_limits: suite to its step limits, in ascending order; empty if the results do not state them.
         left_out: number of episodes that have no outcome, because the scene was rejected or the program failed.
+        black: views that were black, as the setting ``black``; several are joined by `` and ``.
     """
 
     __test__ = False  # not a test case, whatever its name starts with
@@ -41,6 +42,7 @@ class TestedPolicy:
     prompt: str | None
     step_limits: Mapping[str, tuple[int, ...]]
     left_out: int
+    black: str = "none"
 
 
 def tested_policy(policy: Evaluated) -> TestedPolicy | None:
@@ -60,12 +62,13 @@ def tested_in(name: str, rows: Sequence[EpisodeResult]) -> TestedPolicy:
     programs = {str(row.settings.get("runner", "pipeline")) for row in rows}
     program = "evaluate" if programs == {"pipeline"} else " and ".join(sorted(programs))
     limits = limits_of((row.suite, row.step_limit) for row in rows)
-    return TestedPolicy(name, outcomes, program, joined({row.prompt for row in rows}), limits, 0)
+    black = joined({str(row.settings.get("black", "none")) for row in rows})
+    return TestedPolicy(name, outcomes, program, joined({row.prompt for row in rows}), limits, 0, black)
 
 
-def joined(prompts: Iterable[str]) -> str:
-    """Join the kinds of prompts."""
-    return " and ".join(sorted(prompts))
+def joined(kinds: Iterable[str]) -> str:
+    """Join kinds of prompts, or of black views."""
+    return " and ".join(sorted(kinds))
 
 
 def limits_of(limits: Iterable[tuple[str, int]]) -> dict[str, tuple[int, ...]]:

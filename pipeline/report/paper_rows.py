@@ -39,6 +39,7 @@ class Row(NamedTuple):
     """One model's row, with each number as all formats print it.
 
     Attributes:
+        black: views that were black.
         rates: heading to the rate in percent; `None` if it was not measured.
         intervals: heading to the bounds of the 95 % interval in percent, of measured rates.
         partial: headings whose rate leaves out a part of the benchmark.
@@ -53,6 +54,7 @@ class Row(NamedTuple):
     step_limits: str
     trials: str
     left_out: int
+    black: str
     rates: Mapping[str, str | None]
     intervals: Mapping[str, tuple[str, str]]
     partial: frozenset[str]
@@ -88,6 +90,7 @@ def _evaluated(row: Mapping[str, Any]) -> Row:
         step_limits=_limits(protocol["step_limits"]),
         trials=str(fewest) if fewest == most else f"{fewest} to {most}",
         left_out=protocol["left_out"],
+        black=protocol["black"],
         rates={heading: _percent(measured[heading]["rate"]) if heading in measured else None for heading in COLUMNS},
         intervals={
             heading: (_percent(estimate["low"]), _percent(estimate["high"])) for heading, estimate in measured.items()
@@ -110,6 +113,7 @@ def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> Row:
         step_limits=protocol["step_limits"],
         trials=str(protocol["trials"]),
         left_out=0,
+        black="none",
         rates={heading: f"{rates[heading]:.1f}" for heading in COLUMNS},
         intervals={},
         partial=frozenset(),
@@ -185,10 +189,11 @@ def _notes(row: Row) -> Iterator[str]:
 def _protocol(row: Row) -> str:
     """Describe the protocol of an evaluated policy."""
     trials = "trial" if row.trials == "1" else "trials"
+    black = "" if row.black == "none" else f"; black views {row.black}"
     left_out = f"; {row.left_out:,} episodes without a result are left out" if row.left_out else ""
     return (
         f"{row.tasks_run['total']:,} tasks; {row.trials} {trials} per task; prompt {row.prompt}; step limits "
-        f"{row.step_limits}; run by {row.program}{left_out}"
+        f"{row.step_limits}{black}; run by {row.program}{left_out}"
     )
 
 
@@ -203,6 +208,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
             *MARKS[".csv"].split(","),
             "trials_per_task",
             "episodes_left_out",
+            "black_views",
             *named.values(),
             *(f"{name}_tasks_run" for name in counted),
             *(f"{name}_{bound}" for name in named.values() for bound in ("low", "high")),
@@ -222,6 +228,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
                 row.step_limits,
                 row.trials,
                 row.left_out,
+                row.black,
                 *(row.rates[heading] or "" for heading in COLUMNS),
                 *(row.tasks_run[name] for name in counted),
                 *bounds,

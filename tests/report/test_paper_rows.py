@@ -169,6 +169,26 @@ def test_any_name_is_one_cell_in_each_format() -> None:
 # Results of evaluate, and the command.
 
 
+def test_black_views_are_stated(tmp_path: Path) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    task = EvaluationTask("libero_plus", *(test.suite, test.base, test.name, test.axis, test.component), 1, 0)
+    EpisodeFiles(tmp_path / "rows").save(result(task, settings={"prompt": "clean", "seed": 0, "black": "agentview"}))
+    EpisodeFiles(tmp_path / "seeing").save(result(task, policy="seeing"))
+    config = {"benchmark": OUR_CLASS, "params": {"settings": {"black": "all"}}}
+    write_vla_eval(tmp_path / "blind", config, [(our_task(test), {"success": False})])
+    table = table_of(read_tested([tmp_path / "rows", tmp_path / "seeing", tmp_path / "blind"]))
+    texts = markdown(table), latex(table)
+    for views in ("agentview", "all"):
+        assert all(text.count(f"step limits goal 300; black views {views}; run by") == 1 for text in texts)
+    lines = of_csv(csv_text(table))
+    assert [lines[name]["black_views"] for name in ("p", "seeing", "blind", "pi0")] == [
+        "agentview",
+        "none",
+        "all",
+        "none",
+    ]
+
+
 def test_analyze_table_prints_and_writes_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = EpisodeFiles(tmp_path / "act")
     for test in first_of("libero_goal", "robot", 4):
