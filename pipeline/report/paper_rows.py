@@ -2,10 +2,12 @@
 
 import csv
 import io
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pipeline.errors import PipelineError
 from pipeline.files import refuse_other_file, write
 from pipeline.report.paper_table import DIMENSIONS
 
@@ -30,9 +32,15 @@ LATEX = {
     "}": r"\}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
+    "|": r"\textbar{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
     **{character: f"\\{character}" for character in "&%$#_"},
 }
 """Character to its LaTeX command, for characters that LaTeX does not print as they are."""
+
+MARKUP = re.compile(r"[\\`*<|~\[]|&(?=[#\w])|(?<![^\W_])_|_(?![^\W_])")
+"""Characters that Markdown does not print as they are; an underscore inside a word is printed."""
 
 
 class Row(NamedTuple):
@@ -164,8 +172,12 @@ def markdown(table: Mapping[str, Any]) -> str:
 
 def _line(name: str, cells: Sequence[str]) -> str:
     """Return a line of a Markdown table."""
-    escaped = " ".join(name.split()).replace("|", "\\|")
-    return f"| {' | '.join([escaped, *cells])} |"
+    return f"| {' | '.join([_escaped(name), *cells])} |"
+
+
+def _escaped(name: str) -> str:
+    """Return a name as Markdown text in one line."""
+    return MARKUP.sub(r"\\\g<0>", " ".join(name.split()))
 
 
 def _starred(row: Row, heading: str, star: str) -> str:
@@ -180,7 +192,7 @@ def _notes(row: Row) -> Iterator[str]:
     """Yield the protocol of an evaluated policy and its left-out parts, each as a line of a Markdown list."""
     if row.published:
         return
-    name = " ".join(row.name.split())
+    name = _escaped(row.name)
     yield f"- {name}: {_protocol(row)}."
     for column, parts in row.absent.items():
         yield f"- \\* {name}, {column}: without {parts}."
@@ -246,6 +258,8 @@ def latex(table: Mapping[str, Any]) -> str:
             continue
         cells = [_starred(row, heading, "$^{*}$") or "--" for heading in COLUMNS]
         name = "".join(LATEX.get(character, character) for character in " ".join(row.name.split()))
+        # After the end of the line before, `[` and `*` would begin an option of that end.
+        name = f"{{}}{name}" if name.startswith(("[", "*")) else name
         lines.append(f"% {_protocol(row)}")
         lines += [f"% * {column}: without {parts}" for column, parts in row.absent.items()]
         lines.append(f"{' & '.join([name, *cells])} \\\\")
@@ -281,7 +295,9 @@ def refuse_other_tables(path: Path) -> None:
         path: path of the three files without their suffix.
 
     Raises:
-        PipelineError: if a file is rejected; it names the file.
+        PipelineError: if a file is rejected, or if the path has no name of a file; it names the path.
     """
+    if path.name in ("", ".."):
+        raise PipelineError("the path has no name for the files", where=path, expected="a name such as tables/mine")
     for suffix, mark in MARKS.items():
         refuse_other_file(path.with_name(path.name + suffix), mark)

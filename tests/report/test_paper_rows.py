@@ -20,6 +20,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import eval_policy_all
+from markdown_it import MarkdownIt
 from vla_eval.recording import EpisodeRecorder, RecordingStore, db_path_for_eval, serializable_task_kwargs
 from vla_eval.results.export import export_eval
 
@@ -38,6 +39,9 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TESTED_SUITES, TestTask
 
 SEVEN = ("camera", "robot", "language", "light", "background", "noise", "layout")
+CELL_LEVEL = 4
+"""Level of a cell's text in the tokens of a Markdown table."""
+
 THEIR_CLASS = "vla_eval.benchmarks.libero_plus.benchmark:LIBEROPlusBenchmark"
 CATEGORY = {"camera": "Camera Viewpoints", "robot": "Robot Initial States", "pose": "Objects Layout"}
 POLICY = TestedPolicy("mine", (), "evaluate", "clean", {"libero_goal": (300,), "libero_10": (520,)}, 0)
@@ -69,9 +73,15 @@ def counted(outcomes: Iterable[Outcome]) -> dict[str, str]:
 
 
 def of_markdown(text: str) -> dict[str, list[str]]:
-    """First cell to the other cells of each line of a Markdown table."""
-    lines = [re.split(r"(?<!\\)\|", line.strip("|")) for line in text.splitlines() if line.startswith("|")]
-    return {cells[0].strip().replace(r"\|", "|"): [cell.strip() for cell in cells[1:]] for cells in lines}
+    """First cell to the other cells of each line of a Markdown table, as a program for Markdown prints them."""
+    rows: list[list[str]] = []
+    for token in MarkdownIt("commonmark").enable("table").parse(text):
+        if token.type == "tr_open":
+            rows.append([])
+        elif token.type == "inline" and rows and token.level == CELL_LEVEL:
+            assert {part.type for part in token.children or ()} <= {"text"}, f"no markup: {token.content}"
+            rows[-1].append("".join(part.content for part in token.children or ()))
+    return {cells[0]: cells[1:] for cells in rows}
 
 
 def of_csv(text: str) -> dict[str, dict[str, str]]:
@@ -157,13 +167,26 @@ def test_several_trials_of_a_task_count_as_one_task() -> None:
 
 
 def test_any_name_is_one_cell_in_each_format() -> None:
-    name = "50%_a&b|c \\ {x} #1 $2 ^~\nsecond"
+    name = "50%_a&lt;|c \\ {x} #1 $2 ^~\nsecond <b> *i* `c` _u_ [l](m) d\\|e pi_0 é"
     table = table_of([replace(POLICY, name=name, outcomes=scored(first_of("libero_goal", "robot", 3)))])
-    assert "50%_a&b|c \\ {x} #1 $2 ^~ second" in of_markdown(markdown(table))
+    assert name.replace("\n", " ") in of_markdown(markdown(table))
     assert name in {line[0] for line in csv.reader(csv_text(table).splitlines(keepends=True))}
     (row,) = of_latex(latex(table))
     assert len(row) == 10
-    assert row[0] == r"50\%\_a\&b|c \textbackslash{} \{x\} \#1 \$2 \textasciicircum{}\textasciitilde{} second"
+    first, second = row[0].split(" second ")
+    assert first == (r"50\%\_a\&lt;\textbar{}c \textbackslash{} \{x\} \#1 \$2 \textasciicircum{}\textasciitilde{}")
+    assert second == (r"\textless{}b\textgreater{} *i* `c` \_u\_ [l](m) d\textbackslash{}\textbar{}e pi\_0 é")
+
+
+@pytest.mark.parametrize("name", ["[ours] act", "*act"])
+def test_a_name_is_no_option_of_the_line_before(name: str) -> None:
+    """In LaTeX, a row ends with two backslashes, which take a star and an option in brackets from the next line."""
+    outcomes = scored(first_of("libero_goal", "robot", 3))
+    text = latex(table_of([replace(POLICY, outcomes=outcomes), replace(POLICY, name=name, outcomes=outcomes)]))
+    code = "".join(line for line in text.splitlines() if not line.startswith("%"))
+    assert len(code.split(r"\\")) == 3
+    assert not re.search(r"\\\\\s*[\[*]", code)
+    assert name in code
 
 
 # Results of evaluate, and the command.
@@ -209,6 +232,9 @@ def test_analyze_table_prints_and_writes_the_table(tmp_path: Path, capsys: pytes
     assert written[0].read_text() in printed
     assert of_csv(written[1].read_text()).keys() >= {"act, prompt clean", "OpenVLA"}
     assert len(of_latex(written[2].read_text())) == 2
+    for name in (".", ".."):
+        assert analyze("table", str(tmp_path / "act"), "--out", name) == 1
+        assert "no name for the files" in capsys.readouterr().err
     written[2].write_text("notes of a user")
     assert analyze("table", str(tmp_path / "act"), "--out", str(out)) == 1
     assert "would overwrite" in capsys.readouterr().err
