@@ -25,6 +25,9 @@ these settings, the prompt and the step limit are equal."""
 PER_TASK = ("draws", "files of the benchmark", "definition of the task", "demonstration")
 """Versions of a result that differ between tasks."""
 
+RECORDED = ("pipeline", "vla-eval")
+"""Versions of a result that do not decide whether the result is up to date."""
+
 Trial = tuple[EvaluationTask, int, str]
 """Task, seed and perturbations. Results of two policies can be compared one by one if their trials are equal."""
 
@@ -292,6 +295,22 @@ def _agree(
             raise PipelineError(
                 f"{what}{name}: {', '.join(differing)}", where=f"{where} and {file}", expected=expected, remedy=remedy
             )
+
+
+def versions_of(rows: Iterable[EpisodeResult]) -> dict[str, list[str]]:
+    """List the versions of results by name, without versions that differ between tasks."""
+    versions: dict[str, set[str]] = {}
+    for row in rows:
+        for name, version in row.versions.items():
+            if name not in PER_TASK:
+                versions.setdefault(name, set()).add(version)
+    return {name: sorted(found) for name, found in versions.items()}
+
+
+def mixed_versions(rows: Iterable[EpisodeResult]) -> dict[str, list[str]]:
+    """List the versions of results by name, for names with several versions; ``RECORDED`` is left out."""
+    named = versions_of(rows)
+    return {name: found for name, found in named.items() if len(found) > 1 and name not in RECORDED}
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """Outcomes of policies on LIBERO-Plus's test tasks, from this project's evaluations or from another program."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from pipeline.evaluation.results import EpisodeResult, Evaluated
+from pipeline.evaluation.results import EpisodeResult, Evaluated, mixed_versions
 
 
 class Outcome(NamedTuple):
@@ -32,6 +32,7 @@ class TestedPolicy:
         step_limits: suite to its step limits, in ascending order; empty if the results do not state them.
         left_out: number of episodes that have no outcome, because the scene was rejected or the program failed.
         black: views that were black, as the setting ``black``; several are joined by `` and ``.
+        mixed_versions: name to the versions of the episodes, where they have several.
     """
 
     __test__ = False  # not a test case, whatever its name starts with
@@ -43,6 +44,7 @@ class TestedPolicy:
     step_limits: Mapping[str, tuple[int, ...]]
     left_out: int
     black: str = "none"
+    mixed_versions: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 def tested_policy(policy: Evaluated) -> TestedPolicy | None:
@@ -63,7 +65,8 @@ def tested_in(name: str, rows: Sequence[EpisodeResult]) -> TestedPolicy:
     program = "evaluate" if programs == {"pipeline"} else " and ".join(sorted(programs))
     limits = limits_of((row.suite, row.step_limit) for row in rows)
     black = joined({str(row.settings.get("black", "none")) for row in rows})
-    return TestedPolicy(name, outcomes, program, joined({row.prompt for row in rows}), limits, 0, black)
+    prompt = joined({row.prompt for row in rows})
+    return TestedPolicy(name, outcomes, program, prompt, limits, 0, black, mixed_versions(rows))
 
 
 def joined(kinds: Iterable[str]) -> str:

@@ -48,6 +48,7 @@ class Row(NamedTuple):
 
     Attributes:
         black: views that were black.
+        mixed_versions: names and versions, where the episodes have several.
         rates: heading to the rate in percent; `None` if it was not measured.
         intervals: heading to the bounds of the 95 % interval in percent, of measured rates.
         partial: headings whose rate leaves out a part of the benchmark.
@@ -63,6 +64,7 @@ class Row(NamedTuple):
     trials: str
     left_out: int
     black: str
+    mixed_versions: str
     rates: Mapping[str, str | None]
     intervals: Mapping[str, tuple[str, str]]
     partial: frozenset[str]
@@ -99,6 +101,7 @@ def _evaluated(row: Mapping[str, Any]) -> Row:
         trials=str(fewest) if fewest == most else f"{fewest} to {most}",
         left_out=protocol["left_out"],
         black=protocol["black"],
+        mixed_versions=", ".join(f"{name} {' and '.join(found)}" for name, found in protocol["mixed_versions"].items()),
         rates={heading: _percent(measured[heading]["rate"]) if heading in measured else None for heading in COLUMNS},
         intervals={
             heading: (_percent(estimate["low"]), _percent(estimate["high"])) for heading, estimate in measured.items()
@@ -122,6 +125,7 @@ def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> Row:
         trials=str(protocol["trials"]),
         left_out=0,
         black="none",
+        mixed_versions="",
         rates={heading: f"{rates[heading]:.1f}" for heading in COLUMNS},
         intervals={},
         partial=frozenset(),
@@ -202,10 +206,11 @@ def _protocol(row: Row) -> str:
     """Describe the protocol of an evaluated policy."""
     trials = "trial" if row.trials == "1" else "trials"
     black = "" if row.black == "none" else f"; black views {row.black}"
+    versions = f"; several versions: {row.mixed_versions}" if row.mixed_versions else ""
     left_out = f"; {row.left_out:,} episodes without a result are left out" if row.left_out else ""
     return (
         f"{row.tasks_run['total']:,} tasks; {row.trials} {trials} per task; prompt {row.prompt}; step limits "
-        f"{row.step_limits}{black}; run by {row.program}{left_out}"
+        f"{row.step_limits}{black}; run by {row.program}{versions}{left_out}"
     )
 
 
@@ -221,6 +226,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
             "trials_per_task",
             "episodes_left_out",
             "black_views",
+            "mixed_versions",
             *named.values(),
             *(f"{name}_tasks_run" for name in counted),
             *(f"{name}_{bound}" for name in named.values() for bound in ("low", "high")),
@@ -241,6 +247,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
                 row.trials,
                 row.left_out,
                 row.black,
+                row.mixed_versions,
                 *(row.rates[heading] or "" for heading in COLUMNS),
                 *(row.tasks_run[name] for name in counted),
                 *bounds,

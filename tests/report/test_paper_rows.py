@@ -266,6 +266,27 @@ def test_evaluate_prints_and_writes_the_table_of_its_folder(
     assert (out / "paper_table.csv").read_text() == "a user's own file"
 
 
+def test_episodes_of_several_versions_are_stated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = []
+    for version, test in zip(("3.2.7", "3.8.1"), first_of("libero_goal", "robot", 2), strict=True):
+        task = EvaluationTask("libero_plus", *(test.suite, test.base, test.name, test.axis, test.component), 1, 0)
+        versions = {"mujoco": version, "OpenGL": "llvmpipe", "pipeline": version, "files of the benchmark": version}
+        folders.append(tmp_path / version)
+        EpisodeFiles(folders[-1]).save(result(task, versions=versions))
+    stated = "several versions: mujoco 3.2.7 and 3.8.1"
+    for chosen in (folders, folders[:1]):
+        policies = read_tested(chosen)
+        table = table_of(policies)
+        assert (f"run by evaluate; {stated}." in markdown(table)) == (len(chosen) == 2)
+        assert (f"run by evaluate; {stated}\n" in latex(table)) == (len(chosen) == 2)
+        expected = "mujoco 3.2.7 and 3.8.1" if len(chosen) == 2 else ""
+        assert of_csv(csv_text(table))["p"]["mixed_versions"] == expected
+        page = tmp_path / "report.html"
+        assert analyze("report", *map(str, chosen), "--out", str(page)) == 0
+        assert ("<b>The results have several versions of mujoco.</b>" in page.read_text()) == (len(chosen) == 2)
+    capsys.readouterr()
+
+
 def test_results_without_test_tasks_are_named(tmp_path: Path) -> None:
     task = EvaluationTask("libero", "libero_goal", "turn_on_the_stove", "turn_on_the_stove_state0", "clean", "", 0, 0)
     EpisodeFiles(tmp_path).save(result(task, True))
