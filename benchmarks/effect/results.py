@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import EpisodeResult
-from pipeline.evaluation.rollout import RECORDED
+from pipeline.evaluation.results import RECORDED, EpisodeResult
 from pipeline.files import read_json, replaced
 
 

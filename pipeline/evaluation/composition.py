@@ -30,7 +30,14 @@ from scipy.stats import chi2_contingency
 
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
+from pipeline.evaluation.results import (
+    REFUSED,
+    EpisodeResult,
+    Stored,
+    one_setting,
+    refuse_different,
+    refuse_repeated_tasks,
+)
 from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
 from pipeline.types import Floats
@@ -131,11 +138,13 @@ def pairs(results: Iterable[Stored]) -> list[Pair]:
     """Count the successes of every pair of axes among results, over the trials with all four combinations.
 
     Raises:
-        PipelineError: if the results have several policies or settings, or if no trial is complete.
+        PipelineError: if the results have several policies or settings, or two episodes of a task, or if no trial is
+            complete.
     """
     of_pairs = [(row, files) for row, files in results if row.source in ("libero", "own") and row.reason != REFUSED]
     one_setting(of_pairs)
     refuse_different(of_pairs)
+    refuse_repeated_tasks(of_pairs)
     rows = [row for row, _ in of_pairs]
     # The combinations of a trial share suite, LIBERO task and number of the initial state.
     combined = {(row.axis, row.level, (row.suite, row.base, row.number)): row for row in rows}

@@ -139,19 +139,26 @@ def attempts(paths: Sequence[Path]) -> list[Attempt]:
     for evaluated in read(folders, ("prompt", "step_limit")) if folders else ():
         settings = evaluated.settings
         if settings.get("black", "none") != "none" or settings.get("prompt") == "blank":
-            raise PipelineError(
-                f"{evaluated.name} had black views or no instruction, so its failures do not show lacking episodes",
-                where=", ".join(map(str, folders)),
-                expected="results of policies with their views and instructions",
-                remedy="leave out the folder",
-            )
+            raise _without_observation(evaluated.name, folders)
         listed += filter(None, (_attempt(evaluated.name, row) for row in evaluated.rows))
     for policy in policies:
+        if policy.black != "none" or "blank" in (policy.prompt or ""):
+            raise _without_observation(policy.name, paths)
         for outcome in policy.outcomes:
             test = benchmark.load().find(outcome.suite, outcome.name)
             task = f"{test.suite}/{test.base}"
             listed.append(Attempt(policy.name, (test.axis,), level_of_test(test), task, not outcome.success))
     return listed
+
+
+def _without_observation(name: str, paths: Sequence[Path]) -> PipelineError:
+    """Return the error about a policy that had black views or no instruction."""
+    return PipelineError(
+        f"{name} had black views or no instruction, so its failures do not show lacking episodes",
+        where=", ".join(map(str, paths)),
+        expected="results of policies with their views and instructions",
+        remedy="leave out the folder",
+    )
 
 
 def _attempt(policy: str, row: EpisodeResult) -> Attempt | None:

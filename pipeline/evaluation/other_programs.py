@@ -118,12 +118,14 @@ class _Episode:
         prompt: kind of the prompt; `None` if the file does not state it.
         step_limit: step limit; `None` if the file does not state it.
         success: whether the episode reached its goal; `None` if it has no outcome.
+        black: views that were black; other programs' own benchmarks have no such setting.
     """
 
     test: TestTask
     prompt: str | None
     step_limit: int | None
     success: bool | None
+    black: str = "none"
 
 
 def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
@@ -160,7 +162,8 @@ def separate(paths: Sequence[Path]) -> tuple[list[Path], list[TestedPolicy]]:
         The folders, and the outcomes of the policies of other programs.
 
     Raises:
-        PipelineError: if a file is damaged, if it has no results on test tasks, or if two policies have one name.
+        PipelineError: if a file is damaged, if it has no results on test tasks, if a folder has results of several
+            programs, or if two policies have one name.
     """
     folders: list[Path] = []
     policies: list[TestedPolicy] = []
@@ -188,10 +191,23 @@ def _refuse_shared_names(policies: Sequence[TestedPolicy], paths: Sequence[Path]
 
 
 def _files(path: Path) -> tuple[list[Path], Path | None]:
-    """Return the files of vla-eval, and the file of lerobot-eval, at a path."""
+    """Return the files of vla-eval, and the file of lerobot-eval, at a path.
+
+    Raises:
+        PipelineError: if the path is a folder with results of several programs.
+    """
     if path.is_dir():
-        lerobot = path / LEROBOT
-        return sorted(path.glob(f"*{VLA_EVAL}")), lerobot if lerobot.is_file() else None
+        vla_eval = sorted(path.glob(f"*{VLA_EVAL}"))
+        lerobot = path / LEROBOT if (path / LEROBOT).is_file() else None
+        rows = any((path / "episodes").glob("*.json"))
+        if [bool(vla_eval), lerobot is not None, rows].count(True) > 1:
+            raise PipelineError(
+                "the folder has results of several programs",
+                where=path,
+                expected=f"episodes/*.json of `evaluate`, *{VLA_EVAL} of vla-eval, or {LEROBOT} of lerobot-eval",
+                remedy="move the results of all programs but one to another folder",
+            )
+        return vla_eval, lerobot
     if path.name.endswith(VLA_EVAL):
         return [path], None
     if path.suffix == ".json":
@@ -222,6 +238,7 @@ def _policy(folder: Path, program: str, episodes: Sequence[_Episode]) -> TestedP
         None if None in prompts else joined(kind for kind in prompts if kind is not None),
         limits_of(limits),
         len(episodes) - len(ended),
+        joined({episode.black for episode in ended}),
     )
 
 
@@ -264,7 +281,7 @@ def _vla_eval_episodes(file: Path) -> list[_Episode]:
             remedy="leave this file out, or move it to another folder",
         )
     ours = name == "PerturbedLibero"
-    settings = EpisodeSettings.model_validate(content.config.params.get("settings") or {}) if ours else None
+    settings = _settings(content.config, file) if ours else None
     limit = content.config.max_steps or content.config.params.get("max_steps")
     episodes = []
     for task in content.tasks:
@@ -272,12 +289,33 @@ def _vla_eval_episodes(file: Path) -> list[_Episode]:
             where = f"{file} {episode.suite}/{episode.name}"
             test = _our_test(episode, where) if ours else _their_test(episode, where)
             if settings is not None:
-                prompt, step_limit = str(settings.prompt), settings.step_limit(test.suite)
+                # vla-eval ends an episode at its own limit, too, if that is lower.
+                own_limit = settings.step_limit(test.suite)
+                prompt, step_limit = str(settings.prompt), min(own_limit, limit or own_limit)
             else:
                 prompt, step_limit = _kind_of_prompt(test, episode.name), limit or STEP_LIMITS[test.suite]
-            success = None if episode.failure_reason else bool(episode.metrics.get("success"))
-            episodes.append(_Episode(test, prompt, step_limit, success))
+            ended = not episode.failure_reason and "success" in episode.metrics
+            success = bool(episode.metrics["success"]) if ended else None
+            black = "none" if settings is None else settings.black
+            episodes.append(_Episode(test, prompt, step_limit, success, black))
     return episodes
+
+
+def _settings(config: _VlaEvalConfig, file: Path) -> EpisodeSettings:
+    """Return the settings of this project's benchmark for vla-eval.
+
+    Raises:
+        PipelineError: if they are not settings of this version.
+    """
+    try:
+        return EpisodeSettings.model_validate(config.params.get("settings") or {})
+    except ValidationError as error:
+        raise PipelineError(
+            f"the file has other settings ({_first_fault(error)})",
+            where=f"{file} config.params.settings",
+            expected="settings of this version",
+            remedy="run vla-eval again with this version",
+        ) from error
 
 
 def _our_test(episode: _VlaEvalEpisode, where: str) -> TestTask:
@@ -385,11 +423,16 @@ def _parsed(kind: type[Content], file: Path, expected: str) -> Content:
     try:
         return kind.model_validate(read_json(file, "run the program again"))
     except ValidationError as error:
-        fault = error.errors()[0]
-        location = ".".join(map(str, fault["loc"]))
         raise PipelineError(
-            f"the file has other fields ({location}: {fault['msg']})",
+            f"the file has other fields ({_first_fault(error)})",
             where=file,
             expected=expected,
             remedy="name the folder of the results, or run the program again",
         ) from error
+
+
+def _first_fault(error: ValidationError) -> str:
+    """Return the place and the message of the first fault."""
+    fault = error.errors()[0]
+    location = ".".join(map(str, fault["loc"]))
+    return f"{location}: {fault['msg']}"

@@ -25,6 +25,9 @@ these settings, the prompt and the step limit are equal."""
 PER_TASK = ("draws", "files of the benchmark", "definition of the task", "demonstration")
 """Versions of a result that differ between tasks."""
 
+RECORDED = ("pipeline", "vla-eval")
+"""Versions of a result that do not decide whether the result is up to date."""
+
 Trial = tuple[EvaluationTask, int, str]
 """Task, seed and perturbations. Results of two policies can be compared one by one if their trials are equal."""
 
@@ -216,6 +219,42 @@ def refuse_different(results: Iterable[Stored], across: Collection[str] | None =
     )
 
 
+def refuse_repeated_tasks(results: Iterable[Stored]) -> None:
+    """Reject two episodes of one task among results of one policy under one set of settings.
+
+    Raises:
+        PipelineError: if a task has two episodes; it names their files.
+    """
+    _agree(
+        ((f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode)) for row, files in results),
+        "a task counts twice: ",
+        expected="one episode of each task",
+        remedy="move one of the two files into another folder",
+    )
+
+
+def refuse_repeated_models(results: Sequence[Sequence[Stored]]) -> None:
+    """Reject one model in the place of two.
+
+    Args:
+        results: results of each model.
+
+    Raises:
+        PipelineError: if two of them are of one policy; it names their folders.
+    """
+    folder_of: dict[str, Path] = {}
+    for model_results in results:
+        row, files = model_results[0]
+        if row.identity in folder_of:
+            raise PipelineError(
+                f"both folders have results of {row.policy}, which would count as two models",
+                where=f"{folder_of[row.identity]} and {files.folder}",
+                expected="one folder of each model",
+                remedy="leave one of the folders out; copy results of several machines into one folder",
+            )
+        folder_of[row.identity] = files.folder
+
+
 def refuse_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
     """Reject two policies with one name.
 
@@ -256,6 +295,22 @@ def _agree(
             raise PipelineError(
                 f"{what}{name}: {', '.join(differing)}", where=f"{where} and {file}", expected=expected, remedy=remedy
             )
+
+
+def versions_of(rows: Iterable[EpisodeResult]) -> dict[str, list[str]]:
+    """List the versions of results by name, without versions that differ between tasks."""
+    versions: dict[str, set[str]] = {}
+    for row in rows:
+        for name, version in row.versions.items():
+            if name not in PER_TASK:
+                versions.setdefault(name, set()).add(version)
+    return {name: sorted(found) for name, found in versions.items()}
+
+
+def mixed_versions(rows: Iterable[EpisodeResult]) -> dict[str, list[str]]:
+    """List the versions of results by name, for names with several versions; ``RECORDED`` is left out."""
+    named = versions_of(rows)
+    return {name: found for name, found in named.items() if len(found) > 1 and name not in RECORDED}
 
 
 @dataclass(frozen=True)
@@ -323,12 +378,7 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
         PipelineError: if a task has two episodes.
     """
     acted = [(row, files) for row, files in group if row.reason != REFUSED]
-    _agree(
-        ((f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode)) for row, files in acted),
-        "a task counts twice: ",
-        expected="one episode of each task",
-        remedy="move one of the two files into another folder",
-    )
+    refuse_repeated_tasks(acted)
     settings = group[0][0].settings
     name_parts = [alike[0].policy]
     for key, value in settings.items():

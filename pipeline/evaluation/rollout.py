@@ -22,7 +22,7 @@ from pipeline.evaluation.actions import checked_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.results import PER_TASK, EpisodeFiles, EpisodeResult, refuse_shared_names
+from pipeline.evaluation.results import PER_TASK, RECORDED, EpisodeFiles, EpisodeResult, refuse_shared_names
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum_of, edition
 from pipeline.libero.tasks import SUITES, find_task
@@ -42,9 +42,6 @@ CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffu
 
 REMAKE = f"put `{identity.REMAKE}=1` before the command; or evaluate into another folder"
 """Remedy by which a person allows results to be generated again."""
-
-RECORDED = ("pipeline", "vla-eval")
-"""Versions of a result that do not decide whether the result is up to date."""
 
 
 class PolicyConfig(Frozen, use_attribute_docstrings=True):

@@ -32,7 +32,16 @@ from scipy.stats import binomtest, norm, t
 from pipeline import seeding
 from pipeline.errors import PipelineError
 from pipeline.evaluation.own_draws import drawn_task
-from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, Trial, one_setting, refuse_different
+from pipeline.evaluation.results import (
+    REFUSED,
+    EpisodeResult,
+    Stored,
+    Trial,
+    one_setting,
+    refuse_different,
+    refuse_repeated_models,
+    refuse_repeated_tasks,
+)
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
@@ -262,11 +271,13 @@ def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
         results: results of each model.
 
     Raises:
-        PipelineError: if results of a model have several settings, if models cannot be compared, or if no task was run
-            by all models.
+        PipelineError: if results of a model have several settings or two episodes of a task, or if two results are of
+            one model. Also if models cannot be compared, or if no task was run by all models.
     """
     for model_results in results:
         one_setting(model_results)
+        refuse_repeated_tasks(model_results)
+    refuse_repeated_models(results)
     refuse_different(chain(*results))
     models: list[dict[Trial, bool]] = []
     for model_results in results:

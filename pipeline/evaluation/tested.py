@@ -1,10 +1,10 @@
 """Outcomes of policies on LIBERO-Plus's test tasks, from this project's evaluations or from another program."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from pipeline.evaluation.results import EpisodeResult, Evaluated
+from pipeline.evaluation.results import EpisodeResult, Evaluated, mixed_versions
 
 
 class Outcome(NamedTuple):
@@ -31,6 +31,8 @@ class TestedPolicy:
             results do not state it. Several kinds are joined by `` and ``.
         step_limits: suite to its step limits, in ascending order; empty if the results do not state them.
         left_out: number of episodes that have no outcome, because the scene was rejected or the program failed.
+        black: views that were black, as the setting ``black``; several are joined by `` and ``.
+        mixed_versions: name to the versions of the episodes, where they have several.
     """
 
     __test__ = False  # not a test case, whatever its name starts with
@@ -41,6 +43,8 @@ class TestedPolicy:
     prompt: str | None
     step_limits: Mapping[str, tuple[int, ...]]
     left_out: int
+    black: str = "none"
+    mixed_versions: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 def tested_policy(policy: Evaluated) -> TestedPolicy | None:
@@ -60,12 +64,14 @@ def tested_in(name: str, rows: Sequence[EpisodeResult]) -> TestedPolicy:
     programs = {str(row.settings.get("runner", "pipeline")) for row in rows}
     program = "evaluate" if programs == {"pipeline"} else " and ".join(sorted(programs))
     limits = limits_of((row.suite, row.step_limit) for row in rows)
-    return TestedPolicy(name, outcomes, program, joined({row.prompt for row in rows}), limits, 0)
+    black = joined({str(row.settings.get("black", "none")) for row in rows})
+    prompt = joined({row.prompt for row in rows})
+    return TestedPolicy(name, outcomes, program, prompt, limits, 0, black, mixed_versions(rows))
 
 
-def joined(prompts: Iterable[str]) -> str:
-    """Join the kinds of prompts."""
-    return " and ".join(sorted(prompts))
+def joined(kinds: Iterable[str]) -> str:
+    """Join kinds of prompts, or of black views."""
+    return " and ".join(sorted(kinds))
 
 
 def limits_of(limits: Iterable[tuple[str, int]]) -> dict[str, tuple[int, ...]]:

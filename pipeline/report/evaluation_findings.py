@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import chain, combinations
 from typing import Any
 
-from pipeline.evaluation.results import PER_TASK, EpisodeResult, Evaluated
+from pipeline.evaluation.results import EpisodeResult, Evaluated, mixed_versions, versions_of
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary
 from pipeline.evaluation.tested import tested_policy
 from pipeline.grouping import grouped
@@ -25,6 +25,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     Returns:
         ``policies``: name to settings, versions, number of rejected episodes, ``overall``: the ``success_rate`` of all
         its episodes, and ``results``: ``summary`` by source.
+        ``mixed_versions``: name to the versions of all policies, where they have several.
         ``paper_table``: see ``table_of``; `None` if no test task was run.
         ``comparisons``: each pair of policies on the episodes of a source that both ran, see ``compare``.
         ``common``: source to the number of episodes that all policies with results of the source ran.
@@ -38,6 +39,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     return {
         "policies": {policy.name: _policy_findings(policy, sources) for policy in policies},
         "common": {source: _common_trials(policies, source) for source in sources},
+        "mixed_versions": mixed_versions(chain.from_iterable(policy.rows for policy in policies)),
         "paper_table": table_of(tested) if tested else None,
         "comparisons": _comparisons(policies, sources),
         "failures": _failures(policies),
@@ -53,7 +55,7 @@ def _policy_findings(policy: Evaluated, sources: Sequence[str]) -> dict[str, Any
             results[source] = summary(rows)
     return {
         "settings": policy.settings,
-        "versions": _versions(policy.rows),
+        "versions": versions_of(policy.rows),
         "refused": policy.refused,
         "overall": overall,
         "results": results,
@@ -95,12 +97,3 @@ def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
     failed.sort(key=lambda row: (row.axis, row.episode not in policy.videos, row.level, row.episode))
     groups = grouped(((row.axis, row.source), row) for row in failed)
     return list(chain.from_iterable(group[:FAILURES] for group in groups.values()))
-
-
-def _versions(rows: Sequence[EpisodeResult]) -> dict[str, list[str]]:
-    versions: dict[str, set[str]] = {}
-    for row in rows:
-        for name, version in row.versions.items():
-            if name not in PER_TASK:
-                versions.setdefault(name, set()).add(version)
-    return {name: sorted(found) for name, found in versions.items()}

@@ -2,10 +2,12 @@
 
 import csv
 import io
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pipeline.errors import PipelineError
 from pipeline.files import refuse_other_file, write
 from pipeline.report.paper_table import DIMENSIONS
 
@@ -30,15 +32,23 @@ LATEX = {
     "}": r"\}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
+    "|": r"\textbar{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
     **{character: f"\\{character}" for character in "&%$#_"},
 }
 """Character to its LaTeX command, for characters that LaTeX does not print as they are."""
+
+MARKUP = re.compile(r"[\\`*<|~\[]|&(?=[#\w])|(?<![^\W_])_|_(?![^\W_])")
+"""Characters that Markdown does not print as they are; an underscore inside a word is printed."""
 
 
 class Row(NamedTuple):
     """One model's row, with each number as all formats print it.
 
     Attributes:
+        black: views that were black.
+        mixed_versions: names and versions, where the episodes have several.
         rates: heading to the rate in percent; `None` if it was not measured.
         intervals: heading to the bounds of the 95 % interval in percent, of measured rates.
         partial: headings whose rate leaves out a part of the benchmark.
@@ -53,6 +63,8 @@ class Row(NamedTuple):
     step_limits: str
     trials: str
     left_out: int
+    black: str
+    mixed_versions: str
     rates: Mapping[str, str | None]
     intervals: Mapping[str, tuple[str, str]]
     partial: frozenset[str]
@@ -88,6 +100,8 @@ def _evaluated(row: Mapping[str, Any]) -> Row:
         step_limits=_limits(protocol["step_limits"]),
         trials=str(fewest) if fewest == most else f"{fewest} to {most}",
         left_out=protocol["left_out"],
+        black=protocol["black"],
+        mixed_versions=", ".join(f"{name} {' and '.join(found)}" for name, found in protocol["mixed_versions"].items()),
         rates={heading: _percent(measured[heading]["rate"]) if heading in measured else None for heading in COLUMNS},
         intervals={
             heading: (_percent(estimate["low"]), _percent(estimate["high"])) for heading, estimate in measured.items()
@@ -110,6 +124,8 @@ def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> Row:
         step_limits=protocol["step_limits"],
         trials=str(protocol["trials"]),
         left_out=0,
+        black="none",
+        mixed_versions="",
         rates={heading: f"{rates[heading]:.1f}" for heading in COLUMNS},
         intervals={},
         partial=frozenset(),
@@ -160,8 +176,12 @@ def markdown(table: Mapping[str, Any]) -> str:
 
 def _line(name: str, cells: Sequence[str]) -> str:
     """Return a line of a Markdown table."""
-    escaped = " ".join(name.split()).replace("|", "\\|")
-    return f"| {' | '.join([escaped, *cells])} |"
+    return f"| {' | '.join([_escaped(name), *cells])} |"
+
+
+def _escaped(name: str) -> str:
+    """Return a name as Markdown text in one line."""
+    return MARKUP.sub(r"\\\g<0>", " ".join(name.split()))
 
 
 def _starred(row: Row, heading: str, star: str) -> str:
@@ -176,7 +196,7 @@ def _notes(row: Row) -> Iterator[str]:
     """Yield the protocol of an evaluated policy and its left-out parts, each as a line of a Markdown list."""
     if row.published:
         return
-    name = " ".join(row.name.split())
+    name = _escaped(row.name)
     yield f"- {name}: {_protocol(row)}."
     for column, parts in row.absent.items():
         yield f"- \\* {name}, {column}: without {parts}."
@@ -185,10 +205,12 @@ def _notes(row: Row) -> Iterator[str]:
 def _protocol(row: Row) -> str:
     """Describe the protocol of an evaluated policy."""
     trials = "trial" if row.trials == "1" else "trials"
+    black = "" if row.black == "none" else f"; black views {row.black}"
+    versions = f"; several versions: {row.mixed_versions}" if row.mixed_versions else ""
     left_out = f"; {row.left_out:,} episodes without a result are left out" if row.left_out else ""
     return (
         f"{row.tasks_run['total']:,} tasks; {row.trials} {trials} per task; prompt {row.prompt}; step limits "
-        f"{row.step_limits}; run by {row.program}{left_out}"
+        f"{row.step_limits}{black}; run by {row.program}{versions}{left_out}"
     )
 
 
@@ -203,6 +225,8 @@ def csv_text(table: Mapping[str, Any]) -> str:
             *MARKS[".csv"].split(","),
             "trials_per_task",
             "episodes_left_out",
+            "black_views",
+            "mixed_versions",
             *named.values(),
             *(f"{name}_tasks_run" for name in counted),
             *(f"{name}_{bound}" for name in named.values() for bound in ("low", "high")),
@@ -222,6 +246,8 @@ def csv_text(table: Mapping[str, Any]) -> str:
                 row.step_limits,
                 row.trials,
                 row.left_out,
+                row.black,
+                row.mixed_versions,
                 *(row.rates[heading] or "" for heading in COLUMNS),
                 *(row.tasks_run[name] for name in counted),
                 *bounds,
@@ -239,6 +265,8 @@ def latex(table: Mapping[str, Any]) -> str:
             continue
         cells = [_starred(row, heading, "$^{*}$") or "--" for heading in COLUMNS]
         name = "".join(LATEX.get(character, character) for character in " ".join(row.name.split()))
+        # After the end of the line before, `[` and `*` would begin an option of that end.
+        name = f"{{}}{name}" if name.startswith(("[", "*")) else name
         lines.append(f"% {_protocol(row)}")
         lines += [f"% * {column}: without {parts}" for column, parts in row.absent.items()]
         lines.append(f"{' & '.join([name, *cells])} \\\\")
@@ -274,7 +302,9 @@ def refuse_other_tables(path: Path) -> None:
         path: path of the three files without their suffix.
 
     Raises:
-        PipelineError: if a file is rejected; it names the file.
+        PipelineError: if a file is rejected, or if the path has no name of a file; it names the path.
     """
+    if path.name in ("", ".."):
+        raise PipelineError("the path has no name for the files", where=path, expected="a name such as tables/mine")
     for suffix, mark in MARKS.items():
         refuse_other_file(path.with_name(path.name + suffix), mark)

@@ -74,8 +74,8 @@ def table_of(policies: Sequence[TestedPolicy]) -> dict[str, Any]:
 
     Returns:
         The content of ``paper_table``. Each evaluated row also has its ``protocol``:
-        ``program``, ``prompt``, ``step_limits``, ``left_out``, ``tasks_run`` and ``trials``, the smallest and the
-        largest number of episodes of a task.
+        ``program``, ``prompt``, ``black``, ``step_limits``, ``left_out``, ``mixed_versions``, ``tasks_run`` and
+        ``trials``, the smallest and the largest number of episodes of a task.
     """
     table = paper_table({policy.name: policy.outcomes for policy in policies})
     for row, policy in zip(table["evaluated"], policies, strict=True):
@@ -83,8 +83,10 @@ def table_of(policies: Sequence[TestedPolicy]) -> dict[str, Any]:
         row["protocol"] = {
             "program": policy.program,
             "prompt": policy.prompt,
+            "black": policy.black,
             "step_limits": {suite: list(limits) for suite, limits in policy.step_limits.items()},
             "left_out": policy.left_out,
+            "mixed_versions": policy.mixed_versions,
             "tasks_run": len(episodes),
             "trials": [min(episodes.values()), max(episodes.values())],
         }

@@ -99,6 +99,15 @@ def test_the_gap_leaves_out_a_pair_of_other_draws_than_its_singles(tmp_path: Pat
     assert pair.trials == 1, "the second pair was drawn under another seed"
 
 
+def test_the_gap_counts_no_task_twice(tmp_path: Path) -> None:
+    for task in some_pairs(axes=("robot", "noise")):
+        EpisodeFiles(tmp_path).save(result(task, task.axis == "clean"))
+        if task.axis == "robot+noise":
+            EpisodeFiles(tmp_path).save(result(task, True, episode="another"))
+    with pytest.raises(PipelineError, match=r"a task counts twice: own/.*robot\+noise"):
+        composition.pairs(stored([tmp_path]))
+
+
 @pytest.mark.slow
 def test_a_pair_composes_what_its_singles_draw() -> None:
     evaluated = EpisodeEnvironment()

@@ -226,6 +226,18 @@ def test_a_policy_without_views_or_instruction_is_rejected(tmp_path: Path) -> No
         attempts([tmp_path])
 
 
+@pytest.mark.parametrize("settings", [{"black": "agentview"}, {"prompt": "blank"}])
+def test_such_a_policy_of_vla_eval_is_rejected(tmp_path: Path, settings: dict[str, str]) -> None:
+    test = benchmark.load().on_axis("camera")[0]
+    task = EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, 1, 0)
+    config = {"benchmark": "pipeline.evaluation.harness:PerturbedLibero", "params": {"settings": settings}}
+    episode = task.for_harness() | {"metrics": {"success": False}}
+    file = tmp_path / "libero_aggregate.json"
+    file.write_text(json.dumps({"config": config, "tasks": [{"task": "a", "episodes": [episode]}]}))
+    with pytest.raises(PipelineError, match="black views or no instruction"):
+        attempts([tmp_path])
+
+
 def test_goals_count_for_the_task_that_was_asked_for(tmp_path: Path) -> None:
     """LIBERO-Plus asks for another object of a scene, which no plan does; a carried goal is in plans."""
     listed = select(Selection(source="goals", suites=("libero_spatial", "libero_10")))

@@ -34,7 +34,7 @@ def test_tasks_are_graded_by_the_models_that_solve_them(tmp_path: Path) -> None:
     tasks = select(Selection(suites=(STOVE.suite,)))
     for model in range(4):
         for place, task in enumerate(tasks[: 9 if model == 0 else 10]):
-            EpisodeFiles(tmp_path / str(model)).save(result(task, place > 2 * model))
+            EpisodeFiles(tmp_path / str(model)).save(result(task, place > 2 * model, f"model {model}"))
     graded = tmp_path / "graded.json"
     assert analyze("grade", *(str(tmp_path / str(model)) for model in range(4)), "--out", str(graded)) == 0
     content = json.loads(graded.read_text())
@@ -58,6 +58,20 @@ def test_a_task_that_was_run_twice_under_one_setting_does_not_count_twice(tmp_pa
         EpisodeFiles(tmp_path).save(result(task, True, episode=episode))
     with pytest.raises(PipelineError, match=r"counts twice: libero/.* by p: episode a and b"):
         read([tmp_path])
+
+
+def test_grades_count_neither_a_task_nor_a_model_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+    first, copy, twice = tmp_path / "first", tmp_path / "copy", tmp_path / "twice"
+    for folder in (first, copy):
+        EpisodeFiles(folder).save(result(task, True))
+    for episode in ("a", "b"):
+        EpisodeFiles(twice).save(result(task, episode == "a", "q", episode=episode))
+    graded = tmp_path / "graded.json"
+    for folders, message in (([first, copy], "would count as two models"), ([first, twice], "a task counts twice")):
+        assert analyze("grade", *map(str, folders), "--out", str(graded)) == 1
+        assert message in capsys.readouterr().err
+        assert not graded.exists()
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import eval_policy_all
+from markdown_it import MarkdownIt
 from vla_eval.recording import EpisodeRecorder, RecordingStore, db_path_for_eval, serializable_task_kwargs
 from vla_eval.results.export import export_eval
 
@@ -38,6 +39,9 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TESTED_SUITES, TestTask
 
 SEVEN = ("camera", "robot", "language", "light", "background", "noise", "layout")
+CELL_LEVEL = 4
+"""Level of a cell's text in the tokens of a Markdown table."""
+
 THEIR_CLASS = "vla_eval.benchmarks.libero_plus.benchmark:LIBEROPlusBenchmark"
 CATEGORY = {"camera": "Camera Viewpoints", "robot": "Robot Initial States", "pose": "Objects Layout"}
 POLICY = TestedPolicy("mine", (), "evaluate", "clean", {"libero_goal": (300,), "libero_10": (520,)}, 0)
@@ -69,9 +73,15 @@ def counted(outcomes: Iterable[Outcome]) -> dict[str, str]:
 
 
 def of_markdown(text: str) -> dict[str, list[str]]:
-    """First cell to the other cells of each line of a Markdown table."""
-    lines = [re.split(r"(?<!\\)\|", line.strip("|")) for line in text.splitlines() if line.startswith("|")]
-    return {cells[0].strip().replace(r"\|", "|"): [cell.strip() for cell in cells[1:]] for cells in lines}
+    """First cell to the other cells of each line of a Markdown table, as a program for Markdown prints them."""
+    rows: list[list[str]] = []
+    for token in MarkdownIt("commonmark").enable("table").parse(text):
+        if token.type == "tr_open":
+            rows.append([])
+        elif token.type == "inline" and rows and token.level == CELL_LEVEL:
+            assert {part.type for part in token.children or ()} <= {"text"}, f"no markup: {token.content}"
+            rows[-1].append("".join(part.content for part in token.children or ()))
+    return {cells[0]: cells[1:] for cells in rows}
 
 
 def of_csv(text: str) -> dict[str, dict[str, str]]:
@@ -157,16 +167,49 @@ def test_several_trials_of_a_task_count_as_one_task() -> None:
 
 
 def test_any_name_is_one_cell_in_each_format() -> None:
-    name = "50%_a&b|c \\ {x} #1 $2 ^~\nsecond"
+    name = "50%_a&lt;|c \\ {x} #1 $2 ^~\nsecond <b> *i* `c` _u_ [l](m) d\\|e pi_0 é"
     table = table_of([replace(POLICY, name=name, outcomes=scored(first_of("libero_goal", "robot", 3)))])
-    assert "50%_a&b|c \\ {x} #1 $2 ^~ second" in of_markdown(markdown(table))
+    assert name.replace("\n", " ") in of_markdown(markdown(table))
     assert name in {line[0] for line in csv.reader(csv_text(table).splitlines(keepends=True))}
     (row,) = of_latex(latex(table))
     assert len(row) == 10
-    assert row[0] == r"50\%\_a\&b|c \textbackslash{} \{x\} \#1 \$2 \textasciicircum{}\textasciitilde{} second"
+    first, second = row[0].split(" second ")
+    assert first == (r"50\%\_a\&lt;\textbar{}c \textbackslash{} \{x\} \#1 \$2 \textasciicircum{}\textasciitilde{}")
+    assert second == (r"\textless{}b\textgreater{} *i* `c` \_u\_ [l](m) d\textbackslash{}\textbar{}e pi\_0 é")
+
+
+@pytest.mark.parametrize("name", ["[ours] act", "*act"])
+def test_a_name_is_no_option_of_the_line_before(name: str) -> None:
+    """In LaTeX, a row ends with two backslashes, which take a star and an option in brackets from the next line."""
+    outcomes = scored(first_of("libero_goal", "robot", 3))
+    text = latex(table_of([replace(POLICY, outcomes=outcomes), replace(POLICY, name=name, outcomes=outcomes)]))
+    code = "".join(line for line in text.splitlines() if not line.startswith("%"))
+    assert len(code.split(r"\\")) == 3
+    assert not re.search(r"\\\\\s*[\[*]", code)
+    assert name in code
 
 
 # Results of evaluate, and the command.
+
+
+def test_black_views_are_stated(tmp_path: Path) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    task = EvaluationTask("libero_plus", *(test.suite, test.base, test.name, test.axis, test.component), 1, 0)
+    EpisodeFiles(tmp_path / "rows").save(result(task, settings={"prompt": "clean", "seed": 0, "black": "agentview"}))
+    EpisodeFiles(tmp_path / "seeing").save(result(task, policy="seeing"))
+    config = {"benchmark": OUR_CLASS, "params": {"settings": {"black": "all"}}}
+    write_vla_eval(tmp_path / "blind", config, [(our_task(test), {"success": False})])
+    table = table_of(read_tested([tmp_path / "rows", tmp_path / "seeing", tmp_path / "blind"]))
+    texts = markdown(table), latex(table)
+    for views in ("agentview", "all"):
+        assert all(text.count(f"step limits goal 300; black views {views}; run by") == 1 for text in texts)
+    lines = of_csv(csv_text(table))
+    assert [lines[name]["black_views"] for name in ("p", "seeing", "blind", "pi0")] == [
+        "agentview",
+        "none",
+        "all",
+        "none",
+    ]
 
 
 def test_analyze_table_prints_and_writes_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -189,6 +232,9 @@ def test_analyze_table_prints_and_writes_the_table(tmp_path: Path, capsys: pytes
     assert written[0].read_text() in printed
     assert of_csv(written[1].read_text()).keys() >= {"act, prompt clean", "OpenVLA"}
     assert len(of_latex(written[2].read_text())) == 2
+    for name in (".", ".."):
+        assert analyze("table", str(tmp_path / "act"), "--out", name) == 1
+        assert "no name for the files" in capsys.readouterr().err
     written[2].write_text("notes of a user")
     assert analyze("table", str(tmp_path / "act"), "--out", str(out)) == 1
     assert "would overwrite" in capsys.readouterr().err
@@ -218,6 +264,27 @@ def test_evaluate_prints_and_writes_the_table_of_its_folder(
     (out / "paper_table.csv").write_text("a user's own file")
     assert command(["evaluate", str(out), "--replay", *options, "--workers", "1"]) == 1
     assert (out / "paper_table.csv").read_text() == "a user's own file"
+
+
+def test_episodes_of_several_versions_are_stated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = []
+    for version, test in zip(("3.2.7", "3.8.1"), first_of("libero_goal", "robot", 2), strict=True):
+        task = EvaluationTask("libero_plus", *(test.suite, test.base, test.name, test.axis, test.component), 1, 0)
+        versions = {"mujoco": version, "OpenGL": "llvmpipe", "pipeline": version, "files of the benchmark": version}
+        folders.append(tmp_path / version)
+        EpisodeFiles(folders[-1]).save(result(task, versions=versions))
+    stated = "several versions: mujoco 3.2.7 and 3.8.1"
+    for chosen in (folders, folders[:1]):
+        policies = read_tested(chosen)
+        table = table_of(policies)
+        assert (f"run by evaluate; {stated}." in markdown(table)) == (len(chosen) == 2)
+        assert (f"run by evaluate; {stated}\n" in latex(table)) == (len(chosen) == 2)
+        expected = "mujoco 3.2.7 and 3.8.1" if len(chosen) == 2 else ""
+        assert of_csv(csv_text(table))["p"]["mixed_versions"] == expected
+        page = tmp_path / "report.html"
+        assert analyze("report", *map(str, chosen), "--out", str(page)) == 0
+        assert ("<b>The results have several versions of mujoco.</b>" in page.read_text()) == (len(chosen) == 2)
+    capsys.readouterr()
 
 
 def test_results_without_test_tasks_are_named(tmp_path: Path) -> None:
@@ -296,14 +363,61 @@ def test_results_of_vla_evals_own_benchmark_are_read(tmp_path: Path) -> None:
 
 def test_results_of_this_projects_benchmark_in_vla_eval_are_read(tmp_path: Path) -> None:
     (test,) = first_of("libero_spatial", "noise")
-    named = test.suite, test.base, test.name
-    task = EvaluationTask("libero_plus", *named, test.axis, test.component, level_of_test(test), 0)
     settings = {"prompt": "blank", "step_limits": "lerobot"}
-    config = {"benchmark": "pipeline.evaluation.harness:PerturbedLibero", "params": {"settings": settings}}
-    write_vla_eval(tmp_path, config, [(task.for_harness(), {"success": True})])
+    config = {"benchmark": OUR_CLASS, "params": {"settings": settings}}
+    write_vla_eval(tmp_path, config, [(our_task(test), {"success": True})])
     (policy,) = read_tested([tmp_path])
     assert [*policy.outcomes] == [Outcome(test.suite, test.name, True)]
     assert (policy.prompt, dict(policy.step_limits)) == ("blank", {"libero_spatial": (280,)})
+
+
+OUR_CLASS = "pipeline.evaluation.harness:PerturbedLibero"
+
+
+def our_task(test: TestTask) -> dict[str, Any]:
+    """Task of this project's benchmark for vla-eval."""
+    named = test.suite, test.base, test.name
+    return EvaluationTask("libero_plus", *named, test.axis, test.component, level_of_test(test), 0).for_harness()
+
+
+@pytest.mark.parametrize(("max_steps", "limit"), [(50, 50), (9000, 300), (None, 300)])
+def test_a_limit_of_vla_eval_below_the_suites_is_stated(tmp_path: Path, max_steps: int | None, limit: int) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config: dict[str, Any] = {"benchmark": OUR_CLASS, "max_steps": max_steps, "params": {}}
+    write_vla_eval(tmp_path, config, [(our_task(test), {"success": False})])
+    (policy,) = read_tested([tmp_path])
+    assert dict(policy.step_limits) == {"libero_goal": (limit,)}
+
+
+def test_settings_of_another_version_are_named(tmp_path: Path) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config = {"benchmark": OUR_CLASS, "params": {"settings": {"colour": "red"}}}
+    write_vla_eval(tmp_path, config, [(our_task(test), {"success": True})])
+    with pytest.raises(PipelineError, match=r"other settings .*colour"):
+        read_tested([tmp_path])
+
+
+def test_an_episode_without_the_metric_success_is_left_out(tmp_path: Path) -> None:
+    tests = first_of("libero_goal", "robot", 2)
+    config = {"benchmark": THEIR_CLASS, "params": {"suite": "libero_goal"}}
+    file = write_vla_eval(tmp_path, config, [(their_task(test, test.name), {"success": True}) for test in tests])
+    content = json.loads(file.read_text())
+    content["tasks"][0]["episodes"][0]["metrics"] = {}
+    file.write_text(json.dumps(content))
+    (policy,) = read_tested([tmp_path])
+    assert (len(policy.outcomes), policy.left_out) == (1, 1)
+
+
+@pytest.mark.parametrize("further", ["episodes/0.json", "eval_info.json"])
+def test_results_of_two_programs_in_a_folder_are_rejected(tmp_path: Path, further: str) -> None:
+    (test,) = first_of("libero_goal", "robot")
+    config = {"benchmark": THEIR_CLASS, "params": {"suite": "libero_goal"}}
+    file = write_vla_eval(tmp_path, config, [(their_task(test, "prompt"), {"success": True})])
+    (tmp_path / further).parent.mkdir(exist_ok=True)
+    (tmp_path / further).write_text("{}")
+    with pytest.raises(PipelineError, match="results of several programs"):
+        read_tested([tmp_path])
+    assert len(read_tested([file])) == 1
 
 
 @pytest.mark.parametrize(
