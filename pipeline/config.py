@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, fie
 from pipeline import origins
 from pipeline.axes import AXES, Axes, Axis, axes_of, components_of
 from pipeline.axes.base import Frozen
-from pipeline.axes.language import load_bank
+from pipeline.axes.language import load_bank, load_further_bank
 from pipeline.catalogue import object_sources, texture_sources
 from pipeline.compute_config import ComputeConfig
 from pipeline.config_faults import describe
@@ -342,7 +342,7 @@ class Config(Frozen):
             # The shipped bank has no rewrites of LIBERO-90.
             banks = [load_bank()]
             if axes.language.bank:
-                banks.append(load_bank(axes.language.bank))
+                banks.append(load_further_bank(axes.language.bank))
             without = []
             for task in chosen:
                 if not any(bank.get(task.suite, {}).get(task.name) for bank in banks):

@@ -331,6 +331,19 @@ def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest
     assert found == [tmp_path / name for name in ("runs", "d", "bank.yaml", "own")]
 
 
+@pytest.mark.parametrize(
+    ("suite", "task"), [("libero_goal", "put_the_bowl_on_the_plat"), ("libero_gaol", "put_the_bowl_on_the_plate")]
+)
+def test_a_bank_of_a_task_that_does_not_exist_is_refused(suite: str, task: str, tmp_path: Path) -> None:
+    """The shipped bank has the task's rewrites, so a plan would leave out those of the misspelt one without a word."""
+    bank = tmp_path / "bank.yaml"
+    bank.write_text(yaml.safe_dump({suite: {task: {"paraphrase": ["set the bowl upon the plate"]}}}))
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"name: mine\nplan: {{episodes: {{language: 1}}, axes: {{language: {{bank: {bank}}}}}}}")
+    with pytest.raises(PipelineError, match=rf"bank\.yaml: the bank has rewrites of an unknown task .*{suite}"):
+        load(file)
+
+
 def test_what_a_field_had_before_it_existed_leaves_no_trace() -> None:
     """Finished files are identified by settings: those of before must still be found."""
     config = load(STARTER)

@@ -211,6 +211,28 @@ def read_bank(file: Path) -> Bank:
         ) from error
 
 
+def load_further_bank(file: Path) -> Bank:
+    """Read a user's bank once per process.
+
+    Raises:
+        PipelineError: when the file does not have the bank's form, or has rewrites of an unknown task: a plan would
+            silently ignore them.
+    """
+    bank = load_bank(file)
+    for suite, rewrites_of_task in bank.items():
+        for name in rewrites_of_task:
+            try:
+                find_task(suite, name)
+            except PipelineError as error:
+                raise PipelineError(
+                    f"the bank has rewrites of an unknown task ({error.what})",
+                    where=file,
+                    expected=error.expected,
+                    remedy="correct the name of the suite or of the task, or delete the rewrites",
+                ) from error
+    return bank
+
+
 def deal(
     task: Task,
     classes: tuple[Component, ...] = CLASSES,

@@ -112,6 +112,52 @@ def test_depth_leads_to_the_things_that_the_pixels_are_of(name: str, rendered: R
     assert {"akita_black_bowl_1", "cream_cheese_1", "plate_1"} <= looked_at
 
 
+@pytest.mark.parametrize("name", ["image", "wrist_image", "moved"])
+def test_rays_through_the_pixels_meet_the_things_and_the_distances(
+    name: str, rendered: Rendered, middle: Trajectory
+) -> None:
+    """By MuJoCo's ray casting, which renders nothing; also for robot, table, walls and floor."""
+    model = mujoco.MjModel.from_xml_string(middle.model_xml)
+    data = mujoco.MjData(model)
+    data.qpos[:] = middle.states[1, 1 : 1 + model.nq]
+    mujoco.mj_forward(model, data)
+    geometry = rendered.geometry[STREAMS[name].geometry.stream_id]
+    depth_m, ids = pixels(geometry.maps["depth"][1]) * 1e-4, pixels(geometry.maps["segmentation"][1])
+    camera = geometry.extrinsics.astype(float)
+    if name == "wrist_image":
+        hand = np.eye(4)
+        hand[:3, :3] = Rotation.from_rotvec(rendered.state[1, 3:6]).as_matrix()
+        hand[:3, 3] = rendered.state[1, :3]
+        camera = hand @ camera
+    from_pixels = np.linalg.inv(geometry.intrinsics.astype(float))
+    nearest_m = model.vis.map.znear * model.stat.extent
+    seen_geoms, geom, met = np.array([0, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32), set()
+    for x, y in np.random.default_rng(0).integers(1, len(ids) - 1, (600, 2)):
+        ray = from_pixels @ [x, y, 1.0]  # its z is 1, so multiples of it are distances along the camera's axis
+        distance_m = mujoco.mj_ray(model, data, camera[:3, 3].copy(), camera[:3, :3] @ ray, seen_geoms, 1, -1, geom)
+        around_m = depth_m[y - 1 : y + 2, x - 1 : x + 2]
+        if np.ptp(around_m) > 0.02 or 0 <= distance_m < 1.05 * nearest_m:
+            continue  # edges belong to either side, and cameras cut off what is too near
+        assert depth_m[y, x] == pytest.approx(distance_m, abs=0.0005), (x, y)
+        body = model.body(model.geom_bodyid[geom[0]])
+        root = model.body(body.rootid[0]).name
+        found = rendered.instances[ids[y, x]]
+        met.add(found)
+        assert found == expected_name(body.name, root, model.geom(geom[0]).name), (x, y)
+    assert {"gripper", "table", "flat_stove_1"} <= met
+
+
+def expected_name(body: str, root: str, geom: str) -> str:
+    """Return the name of the thing that a geom of MuJoCo's model belongs to."""
+    if root.endswith("_main"):
+        return root.removesuffix("_main")
+    parts = {"gripper0_": "gripper", "robot0_": "robot", "mount0_": "robot"}
+    for prefix, part in parts.items():
+        if body.startswith(prefix):
+            return part
+    return "table" if root.endswith("table") else geom.rstrip("0123456789").partition("_")[0]
+
+
 def test_boxes_are_the_least_around_the_pixels_of_the_gripper_and_the_goal(rendered: Rendered) -> None:
     knob = rendered.instances.index("flat_stove_1")
     for name in ("image", "wrist_image"):
