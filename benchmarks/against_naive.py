@@ -114,11 +114,12 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
     robot, scene = env.env.robots[0], trajectory.scene
     robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
     env.sim.reset()
-    env.set_init_state(scene.state)
+    # Each computation of the forces is the first guess of the next one, so there are as many as in a replay.
+    env.sim.set_state_from_flattened(scene.state)
     if scene.posture_rad is not None:
         env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
         env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
-        env.sim.forward()
+    env.sim.forward()
     robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
     if scene.posture_rad is not None:
         env.set_init_state(scene.state)
