@@ -114,7 +114,7 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
     robot, scene = env.env.robots[0], trajectory.scene
     robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
     env.sim.reset()
-    # Each computation of the forces is the first guess of the next one, so there are as many as in a replay.
+    # MuJoCo begins its search for the contact forces at the last ones, so they are computed as often as in a replay.
     env.sim.set_state_from_flattened(scene.state)
     if scene.posture_rad is not None:
         env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad

@@ -154,7 +154,7 @@ def test_a_task_whose_scene_a_model_was_refused_is_not_graded(tmp_path: Path) ->
     acted, refused = select(Selection(suites=(STOVE.suite,)))[:2]
     files = EpisodeFiles(tmp_path)
     one = [(result(acted, True), files), (result(refused, reason="refused"), files)]
-    graded = grade([one, [(result(task, True), files) for task in (acted, refused)]])
+    graded = grade([one, [(result(task, True, "other"), files) for task in (acted, refused)]])
     assert [(task["name"], task["solved"]) for task in graded] == [(acted.name, 2)]
 
 
