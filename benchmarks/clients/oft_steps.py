@@ -15,6 +15,7 @@ import json
 import math
 import runpy
 import sys
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,7 @@ def main(data: Path, out: Path) -> None:
         "--shuffle_buffer_size": 200, "--wandb_log_freq": 1,
     }  # fmt: skip
     script = data / "finetune" / "run_openvla_oft.py"
-    sys.argv = [str(script), *(str(word) for option in given.items() for word in option)]
+    sys.argv = [str(script), *map(str, chain.from_iterable(given.items()))]
     runpy.run_path(str(script), run_name="__main__")
     (checkpoint,) = (out / "runs").glob(f"*--{STEPS - 1}_chkpt")
     losses = [values["VLA Train/Loss"] for values in logged if "VLA Train/Loss" in values]

@@ -107,8 +107,9 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
             seeds = episodes[first].keys() & episodes[second].keys()
             pairs: list[Pair] = []
             for seed in sorted(seeds):
-                _refuse_different_tests((first, second), [episodes[arm][seed] for arm in (first, second)], line)
-                pairs += paired(episodes[first][seed], episodes[second][seed])
+                rows_of_first, rows_of_second = episodes[first][seed], episodes[second][seed]
+                _refuse_different_tests(rows_of_first, rows_of_second, f"{first} and {second}", line)
+                pairs += paired(rows_of_first, rows_of_second)
             if pairs:
                 measured = compare(pairs)["all"]["difference"]
                 p_value = max(measured["p_value"] or 0.0, sign_flip(pairs))
@@ -118,14 +119,15 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
     return compared
 
 
-def _refuse_different_tests(arms: tuple[str, str], episodes: Sequence[Sequence[EpisodeResult]], line: str) -> None:
+def _refuse_different_tests(
+    first: Sequence[EpisodeResult], second: Sequence[EpisodeResult], arms: str, line: str
+) -> None:
     """Raise a ``PipelineError`` if the episodes of two arms on a line do not belong to the same tests."""
-    tests_of_first, tests_of_second = ({row.trial for row in rows} for rows in episodes)
+    tests_of_first, tests_of_second = {row.trial for row in first}, {row.trial for row in second}
     if tests_of_first != tests_of_second:
-        first, second = arms
         raise PipelineError(
-            f"{first} and {second} have different tests on {LINES[line]}: {len(tests_of_first)} and "
-            f"{len(tests_of_second)}, of which {len(tests_of_first & tests_of_second)} are equal",
+            f"{arms} have different tests on {LINES[line]}: {len(tests_of_first)} and {len(tests_of_second)}, of which "
+            f"{len(tests_of_first & tests_of_second)} are equal",
             expected="equal tests in the results of all arms",
             remedy="evaluate both arms again with one configuration",
         )

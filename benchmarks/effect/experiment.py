@@ -81,7 +81,7 @@ class FurtherEpisodes(Frozen):
 
     Attributes:
         arm: arm whose episodes come first.
-        run: configuration of the run. It selects the same demonstrations as the run of the experiment.
+        run: configuration of the run. Only its plan differs from the run of the experiment.
     """
 
     arm: str
@@ -159,8 +159,9 @@ class Experiment(Frozen):
                 raise ValueError(f"{arm} is an arm of `arms` and of `further`")
             if further.arm not in self.arms:
                 raise ValueError(f"{arm} adds episodes to an unknown arm {further.arm!r}")
-            if further.config.demos != self.run.demos:
-                raise ValueError(f"{further.run} and {self.data} differ in demos")
+            for section in ("demos", "replay", "filter", "render"):
+                if getattr(further.config, section) != getattr(self.run, section):
+                    raise ValueError(f"{further.run} and {self.data} differ in {section}")
             if further.config.plan.seed == self.run.plan.seed:
                 raise ValueError(f"{further.run} and {self.data} have the same plan.seed, which repeats episodes")
         wanted = self.evaluation.episodes(self.tasks)

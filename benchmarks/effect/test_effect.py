@@ -69,14 +69,14 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
         "all": 212,
     }
     groups = [further.pop("object"), further.pop("spatial")]
-    for group in groups:
+    for group, suite in zip(groups, ("libero_object", "libero_spatial"), strict=True):
+        assert all(task.startswith(f"{suite}/") for task in group.tasks)
         assert group.arms == {"clean": (), "all": axes.arms["all"]}
         assert planned_perturbed(group, "all") == 128
         assert (group.policy, group.evaluation) == (axes.policy, groups[0].evaluation)
         assert group.training == axes.training.model_copy(update={"steps": 8_000})
         same = {"demos": {"tasks"}}
         assert group.run.model_dump(exclude=same) == groups[0].run.model_dump(exclude=same)
-    assert [{task.split("/")[0] for task in group.tasks} for group in groups] == [{"libero_object"}, {"libero_spatial"}]
     goals, many = further.pop("goals"), further.pop("goals_many")
     assert many == goals.model_copy(update={"data": many.data, "arms": many.arms, "decisions": many.decisions})
     same = {"plan": {"episodes"}}
@@ -302,6 +302,7 @@ def test_further_episodes_join_those_of_an_arm(tmp_path: Path, shipped: Experime
     [
         ({"seed": 20261125}, {}, "have the same plan.seed, which repeats episodes"),
         ({}, {"arm": "other"}, "more adds episodes to an unknown arm 'other'"),
+        ({}, {"run": str(EFFECT / "data_goals.yaml")}, "data_goals.yaml and .*data.yaml differ in demos"),
     ],
 )
 def test_further_episodes_that_do_not_fit_are_refused(
