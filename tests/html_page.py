@@ -67,7 +67,9 @@ def screenshot(page: Path, width_px: int, height_px: int) -> NDArray[np.float64]
     quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
     profile = page.with_name("profile")
     target = (f"--screenshot={picture}", f"--window-size={width_px},{height_px}", f"--user-data-dir={profile}")
-    subprocess.run([BROWSER, *options, *quiet, *target, page.as_uri()], check=True, capture_output=True, timeout=120)
+    # A limit of `subprocess` would end the browser's start script alone, and then wait for its other processes.
+    limit = ("timeout", "--kill-after=10", "120")
+    subprocess.run([*limit, BROWSER, *options, *quiet, *target, page.as_uri()], check=True, capture_output=True)
     grey_levels = np.asarray(Image.open(picture).convert("L"), float)
     assert grey_levels.shape == (height_px, width_px)
     return grey_levels

@@ -2,11 +2,13 @@
 
 import base64
 import json
+import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -207,7 +209,20 @@ def test_what_is_held_out_of_v21_is_a_set_of_its_own(
         assert "_val" not in (tmp_path / "finetune" / "starvla_data_config.py").read_text()
 
 
+@pytest.fixture
+def unchanged_scheduling() -> Iterator[None]:
+    """Restore the scheduling of this process.
+
+    lerobot's tools encode videos with SVT-AV1, which gives processes of root real-time priority. Other processes of the
+    machine would then wait for the remaining tests.
+    """
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    yield
+    os.sched_setscheduler(0, policy, parameters)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchanged_scheduling")
 def test_lerobots_tools_keep_the_episodes_ids(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path, with_extras, extras=EXTRAS).root
     dataset = LeRobotDataset(NAME, root=root)

@@ -99,15 +99,17 @@ def test_one_scene_is_opened_in_several_sizes(whole: dict[Task, Trajectory], ope
 def test_matrices_scale_with_the_size(whole: dict[Task, Trajectory], opened: LastScene) -> None:
     """A point at (u + 0.5) of 256 pixels is at (u + 0.5) / 2 of 128 pixels: pixel centres have whole numbers."""
     trajectory = whole[STOVE]
+    found = {}
+    # A renderer of another size opens the scene again.
+    for size_px in (128, 256):
+        renderer = opened.renderer(trajectory.model_xml, size_px)
+        renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+        found[size_px] = {view: matrices(renderer, view) for view in ALL_VIEWS}
     for view in ALL_VIEWS:
-        found = {}
-        for size_px in (128, 256):
-            renderer = opened.renderer(trajectory.model_xml, size_px)
-            renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
-            found[size_px] = matrices(renderer, view)
-        halved = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ found[256][0]
-        np.testing.assert_allclose(found[128][0], halved, rtol=1e-6)
-        np.testing.assert_array_equal(found[128][1], found[256][1])
+        (small_intrinsics, small_extrinsics), (intrinsics, extrinsics) = found[128][view], found[256][view]
+        halved = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ intrinsics
+        np.testing.assert_allclose(small_intrinsics, halved, rtol=1e-6)
+        np.testing.assert_array_equal(small_extrinsics, extrinsics)
 
 
 def test_things_count_as_many_pixels_in_every_size(whole: dict[Task, Trajectory], opened: LastScene) -> None:
