@@ -185,10 +185,13 @@ def configured(clone: Path, **sections: Any) -> None:
 
 
 def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path, short_demos: Path) -> None:
-    def would_run() -> list[str]:
+    def status() -> str:
         done = call(clone, "status", "configs/tiny.yaml")
         assert done.returncode == 0, done.stderr
-        lines = [line.strip() for line in done.stdout.splitlines()]
+        return done.stdout
+
+    def would_run(printed: str) -> list[str]:
+        lines = [line.strip() for line in printed.splitlines()]
         assert any(line.startswith("disk: ") and "GB free" in line for line in lines)
         if "no stage would run: all datasets are finished" in lines:
             return []
@@ -197,51 +200,54 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path
         return [line for line in told if line not in ("disk", "time left")]
 
     before = {file: file.stat().st_mtime_ns for file in clone.rglob("*")}
-    told = call(clone, "status", "configs/tiny.yaml").stdout
-    assert would_run() == []
+    told = status()
+    assert would_run(told) == []
     assert {file: file.stat().st_mtime_ns for file in clone.rglob("*")} == before
     # Three episodes of camera are wanted, planned and kept.
     assert [cell.strip() for cell in next(x for x in told.splitlines() if "camera" in x).split("│")[1:-1]] == [
         *("camera", "3", "3", "3", "3"),
     ]
     (clone / "data/tiny/card").rename(clone / "card")
-    assert would_run() == ["card"]
-    assert "render 0 s, export 0 s, validate 0 s" in call(clone, "status", "configs/tiny.yaml").stdout
+    told = status()
+    assert would_run(told) == ["card"]
+    assert "render 0 s, export 0 s, validate 0 s" in told
     (clone / "card").rename(clone / "data/tiny/card")
     (clone / "data/tiny/leakage.json").write_text("{}")
-    assert would_run() == ["leakage", "card", "report"]
-    assert "leakage: leakage.json has changed" in call(clone, "status", "configs/tiny.yaml").stdout
+    told = status()
+    assert would_run(told) == ["leakage", "card", "report"]
+    assert "leakage: leakage.json has changed" in told
     shutil.copy(finished / "leakage.json", clone / "data/tiny/leakage.json")
     demos = tiny_config(shutil.copytree(short_demos, clone / short_demos.name))["demos"]
     configured(clone, demos=demos)
-    assert would_run() == [], "the place of the demonstrations changes nothing"
+    assert would_run(status()) == [], "the place of the demonstrations changes nothing"
     (clone / short_demos.name / "another").write_text("")
-    assert would_run() == ["plan", "exports and later stages"]
-    assert "plan: changed demos.root/another" in call(clone, "status", "configs/tiny.yaml").stdout
+    told = status()
+    assert would_run(told) == ["plan", "exports and later stages"]
+    assert "plan: changed demos.root/another" in told
     (clone / short_demos.name / "another").unlink()
     configured(clone, export={"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 2}})
-    assert would_run() == ["doctor", "export_rlds", "manifest and later stages"]
+    assert would_run(status()) == ["doctor", "export_rlds", "manifest and later stages"]
     configured(clone, export=tiny_config(clone)["export"])
     rendered, *others = sorted((clone / "data/tiny/frames").glob("*/"))
     shutil.rmtree(rendered)
-    assert would_run() == ["render", "exports and later stages"]
+    assert would_run(status()) == ["render", "exports and later stages"]
     (clone / "data/tiny/trajectories" / f"{others[0].name}.npz").unlink()
-    assert would_run() == ["replay", "render", "exports and later stages"]
+    assert would_run(status()) == ["replay", "render", "exports and later stages"]
     configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
-    assert "plan: changed plan.seed" in call(clone, "status", "configs/tiny.yaml").stdout
+    assert "plan: changed plan.seed" in status()
     (clone / "data/tiny/plan.parquet").unlink()
-    told = call(clone, "status", "configs/tiny.yaml").stdout
+    told = status()
     assert "  plan: " in told
     assert re.search(
         r"no longer needed: \d+ traj.*A run stops before it deletes this work, unless REMAKE=1 allows it", told
     )
     for folder in ("trajectories", "frames"):
         shutil.rmtree(clone / "data/tiny" / folder)
-    told = call(clone, "status", "configs/tiny.yaml").stdout
+    told = status()
     assert re.search(r"no longer needed: \d+ episodes of the datasets", told), "they would be replaced"
     for record in ("rlds.json", "lerobot.json"):
         (clone / "data/tiny" / record).unlink()
-    assert would_run() == ["plan"]
+    assert would_run(status()) == ["plan"]
 
 
 def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
