@@ -318,11 +318,13 @@ def finished(short_demos: Path, once: Once) -> Path:
 def _run_in_clone(short_demos: Path, clone: Path) -> None:
     in_a_clone(tiny_config(short_demos), clone)
     with (clone / "run.log").open("w") as log:
-        command = [sys.executable, "-m", "pipeline", "run", "configs/tiny.yaml"]
-        running = subprocess.Popen(command, cwd=clone, stdout=log, stderr=log, env=IN_SCRIPTS)
-        # Of the command and its stages, the largest process.
+        running = subprocess.Popen(
+            pipeline_command("run", "configs/tiny.yaml"), cwd=clone, stdout=log, stderr=log, env=IN_SCRIPTS
+        )
+        # The usage has the resident memory of the largest process: the command or a process that it started.
         _, status, usage = os.wait4(running.pid, 0)
-    assert status == 0, (clone / "run.log").read_text()
+        running.returncode = os.waitstatus_to_exitcode(status)
+    assert running.returncode == 0, (clone / "run.log").read_text()
     (clone / "largest_process_kb").write_text(str(usage.ru_maxrss))
 
 
@@ -368,9 +370,13 @@ def in_a_clone(config: dict[str, object], clone: Path) -> None:
     subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
 
 
+def pipeline_command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "pipeline", *arguments]
+
+
 def run_pipeline(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Call ``python -m pipeline`` in a folder."""
-    command = [sys.executable, "-m", "pipeline", *arguments]
+    command = pipeline_command(*arguments)
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=IN_SCRIPTS)
 
 

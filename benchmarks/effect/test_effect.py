@@ -277,7 +277,8 @@ def test_each_demonstration_gives_an_arm_one_episode(arm: str, shipped: Experime
     first = set(pending(twins, {}))
     assert {row.demo_id for row in twins if row.trajectory_id in first} == {row.demo_id for row in shown}, "followed"
     planned = {name: experiment.run.plan.episodes[name] for name in experiment.arms[arm]}
-    assert {name: sum(row.axis == name for row in shown) for name in planned} == planned
+    by_axis = Counter(row.axis for row in shown)
+    assert {name: by_axis[name] for name in planned} == planned
 
 
 def test_further_episodes_join_those_of_an_arm(tmp_path: Path, shipped: Experiment) -> None:
