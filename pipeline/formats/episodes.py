@@ -1,6 +1,6 @@
 """Selection of a dataset's episodes, their order, and their division into splits and slices."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count, pairwise
 from typing import NamedTuple
@@ -117,29 +117,26 @@ class Episodes:
             )
         if not validation:
             return {"train": self.ids}
-        chosen = self._origins_for(validation)
+        chosen = demos_for_validation(self.known.values(), validation)
         if not chosen:
             raise too_few(validation, "export.<format>.validation")
         splits: dict[str, list[str]] = {"train": [], "val": []}
         for episode_id, facts in self.known.items():
-            split_name = "val" if _origin(facts) in chosen else "train"
-            splits[split_name].append(episode_id)
+            splits["val" if facts.demo in chosen else "train"].append(episode_id)
         return splits
 
-    def _origins_for(self, validation: float) -> set[tuple[str, str]]:
-        """Choose the given share of each task's origins."""
-        digests_of = grouped((_origin(facts), digest("validation", facts.demo)) for facts in self.known.values())
-        by_task = grouped((task, (min(digests), (task, origin))) for (task, origin), digests in digests_of.items())
-        chosen: set[tuple[str, str]] = set()
-        for origins in by_task.values():
-            first_origins = sorted(origins)[: validating(validation, len(origins))]
-            chosen |= {origin for _, origin in first_origins}
-        return chosen
 
-
-def _origin(facts: Known) -> tuple[str, str]:
-    """Return the task of an episode, and the origin of its demonstration."""
-    return facts.demo.rpartition("/")[0], facts.origin or facts.demo
+def demos_for_validation(known: Iterable[Known], share: float) -> set[str]:
+    """Choose the demonstrations of the split ``val``: all those of the given share of each task's origins."""
+    demos_of_task: dict[str, dict[str, set[str]]] = {}
+    for facts in known:
+        task = facts.demo.rpartition("/")[0]
+        demos_of_task.setdefault(task, {}).setdefault(facts.origin or facts.demo, set()).add(facts.demo)
+    chosen: set[str] = set()
+    for demos_of_origin in demos_of_task.values():
+        origins = sorted(demos_of_origin.values(), key=lambda demos: min(digest("validation", demo) for demo in demos))
+        chosen.update(*origins[: validating(share, len(origins))])
+    return chosen
 
 
 def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:

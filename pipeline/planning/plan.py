@@ -240,11 +240,13 @@ class _Choice(NamedTuple):
 
     Attributes:
         task: the task that the axis perturbs, which an earlier axis may have carried to another scene.
+        earlier: perturbations that the episode's start has from an expansion; none if the episode starts from a reset.
         place: index into the axis's ``entries``.
     """
 
     axis: Axis
     task: Task
+    earlier: Sequence[Perturbation]
     place: int
     perturbation: Perturbation
 
@@ -287,7 +289,7 @@ class Draws:
             key = (demo_id, variant)
             for attempt in range(_ATTEMPTS):
                 choices = self._choices(task, attempt, dealt, earlier, key)
-                perturbations = self._cleared(choices, earlier, (*key, attempt))
+                perturbations = self._cleared(choices, (*key, attempt))
                 content = tuple(perturbation.model_dump_json() for perturbation in perturbations or ())
                 if perturbations and content not in sampled:
                     break
@@ -309,34 +311,26 @@ class Draws:
             turn = dealt.in_turn(axis.entries(task), digest(self.seed, self.name, *key))
             place = turn[attempt % len(turn)]
             perturbation = axis.sample(random, task, place).after(earlier)
-            choices.append(_Choice(axis, task, place, perturbation))
+            choices.append(_Choice(axis, task, earlier, place, perturbation))
             task = perturbation.played(task)
+            if perturbation.reset_seed is not None:
+                earlier = ()
         return choices
 
-    def _cleared(
-        self, choices: Sequence[_Choice], earlier: Sequence[Perturbation], key: tuple[str | int, ...]
-    ) -> tuple[Perturbation, ...] | None:
+    def _cleared(self, choices: Sequence[_Choice], key: tuple[str | int, ...]) -> tuple[Perturbation, ...] | None:
         """Return one perturbation of each choice, or ``None`` if an axis has none that passes ``_clear``."""
         texts = [choice.perturbation for choice in choices]
         instruction = " ".join(change.apply("") for change in texts if isinstance(change, TextPerturbation))
         perturbations = []
-        for number, (axis, task, _, first) in enumerate(choices):
-            clear = self._clear(first, axis, task, instruction, earlier, (*key, number))
+        for number, choice in enumerate(choices):
+            clear = self._clear(choice, instruction, (*key, number))
             if clear is None:
                 return None
             perturbations.append(clear)
         return tuple(perturbations)
 
-    def _clear(
-        self,
-        first: Perturbation,
-        axis: Axis,
-        task: Task,
-        instruction: str,
-        earlier: Sequence[Perturbation],
-        key: tuple[str | int, ...],
-    ) -> Perturbation | None:
-        """Return ``first`` if it is clear, else sample a clear perturbation of its component and level.
+    def _clear(self, choice: _Choice, instruction: str, key: tuple[str | int, ...]) -> Perturbation | None:
+        """Return the chosen perturbation if it is clear, else sample a clear one of its component and level.
 
         A clear perturbation keeps its clearance to the test set, unless the axis keeps none, and the ``instruction``
         does not name it. Component and level are kept because strengths near the test set's would otherwise become
@@ -346,6 +340,7 @@ class Draws:
             The perturbation. ``None`` if many attempts give no clear one, or if the axis takes the entries of a list:
             the caller then tries the next entry.
         """
+        axis, task, first = choice.axis, choice.task, choice.perturbation
 
         def is_clear(perturbation: Perturbation) -> bool:
             if perturbation.named_in(instruction):
@@ -360,7 +355,7 @@ class Draws:
         random = rng(self.seed, self.name, *key)
         axis_at_level = axis.model_copy(update={"levels": (first.level,)})
         for _ in range(_ATTEMPTS):
-            perturbation = axis_at_level.sample(random, task, 0).after(earlier)
+            perturbation = axis_at_level.sample(random, task, 0).after(choice.earlier)
             is_alike = (perturbation.component, perturbation.level) == (first.component, first.level)
             if is_alike and is_clear(perturbation):
                 return perturbation

@@ -19,7 +19,7 @@ from pipeline.clients.files import RECIPE
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum, read_json, schema_file
 from pipeline.formats.base import Format
-from pipeline.formats.episodes import validating
+from pipeline.formats.episodes import Known, demos_for_validation
 from pipeline.generated import generated
 from pipeline.libero.tasks import SUITES
 from pipeline.publish_config import PublishConfig
@@ -128,7 +128,7 @@ def render(
     free = all(FREE.match(credit.licence) for credit in owed) and not (own_suites or own_rewrites)
     axes = _axes(kept, shown)
     demos = {row["demo_id"] for row in kept}
-    of_task = Counter(demo.rpartition("/")[0] for demo in demos)
+    known = [Known(row["suite"], demo=row["demo_id"], origin=row["demo_origin_sha256"]) for row in kept]
     return TEMPLATES.get_template("card.md.j2").render(
         line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
         shown=shown,
@@ -137,7 +137,7 @@ def render(
         metadata=_metadata(shown, name, publish, free=free, libero=libero).to_yaml(),
         publish=publish,
         demos=demos,
-        held_out=sum(validating(shown.options.validation, number) for number in of_task.values()),
+        held_out=demos_for_validation(known, shown.options.validation),
         others=" and ".join(others),
         name=name,
         kept=kept,

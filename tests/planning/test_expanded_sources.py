@@ -101,6 +101,19 @@ def test_displacements_of_one_expansion_after_the_other_add_up() -> None:
     assert "source_moves" not in unmoved.model_dump_json()
 
 
+def test_a_reset_of_another_scene_has_none_of_an_expansions_displacements(tmp_path: Path) -> None:
+    entries = write_expanded(tmp_path).index([MILK]).entries
+    axes = {"goal": {}, "pose": {"components": ["target"]}}
+    config = PlanConfig.model_validate({"axes": axes, "episodes": {"goal+pose": 40, "pose": 40}, "reserve": 0})
+    moved = {"goal+pose": 0, "pose": 0}
+    for row in plan.make(entries, config, ReplayConfig(), benchmark.load(FOLDER)):
+        for drawn in from_json(row.perturbations):
+            if isinstance(drawn, PosePerturbation):
+                moved[row.axis] += 1
+                assert (drawn.shifts_in_all == drawn.shifts) == (row.axis == "goal+pose")
+    assert moved == {"goal+pose": 40, "pose": 40}
+
+
 def test_an_expansion_of_an_unknown_version_is_named(tmp_path: Path) -> None:
     (entry, *_) = write_expanded(tmp_path, '[{"axis":"gravity"}]').index([MILK]).entries
     config = PlanConfig.model_validate({"episodes": {"pose": 1}})

@@ -207,6 +207,14 @@ def test_a_validation_split_is_named(data: Path, kind: str, words: str) -> None:
     assert words in told.partition("## Episodes")[0]
 
 
+def test_demonstrations_of_one_origin_are_held_out_together(data: Path) -> None:
+    """Six demonstrations of a task come from three human ones; half of these, rounded to even, are two."""
+    pairs = [(f"{MILK.suite}/{MILK.name}/demo_{number}", f"origin {number // 2}") for number in range(6)]
+    write_rows(data, [row("clean", demo_id=demo, demo_origin_sha256=origin) for demo, origin in pairs])
+    split = {"rlds": RldsConfig(name=NAME, shards=1, validation=0.5), "lerobot": None}
+    assert "For validation, 4 of the 6 demonstrations" in written(data, "rlds", ExportConfig.model_validate(split))
+
+
 def test_what_was_not_compared_is_counted(data: Path) -> None:
     leakage = json.loads((data / "leakage.json").read_text())
     leakage["camera"] |= {"not_compared": 3, "verdict": "unknown"}

@@ -13,17 +13,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import BOWL, MILK, STOVE, rot, run_stages, tiny_config
+from conftest import BOWL, MILK, STOVE, rot, run_stages, starter_demo, tiny_config
 
+from pipeline.axes.robot import RobotPerturbation
 from pipeline.compute.pool import loop
-from pipeline.config import RenderConfig, load
+from pipeline.config import RenderConfig, ReplayConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum
 from pipeline.formats import rlds_write
 from pipeline.formats.lerobot.write import Video
-from pipeline.formats.read_back import Copy, Fault
+from pipeline.formats.read_back import Copy
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.images.jpeg import decode, encode
+from pipeline.physics.environment import Environment
+from pipeline.physics.replay import replay
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.run import Run
@@ -218,24 +221,39 @@ def test_a_good_run_passes(finished: Path) -> None:
     assert not (finished / ".work").exists()
 
 
-def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory]) -> None:
-    """On a whole demonstration: in the last second of one, fingers hardly move."""
-    trajectory = whole[MILK]
+def found_of_gripper(trajectory: Trajectory, sign: float = 1.0) -> list[str]:
+    """Check a copy of a trajectory whose commands of the gripper are multiplied by ``sign``."""
     action = trajectory.actions.astype(np.float32)
     state = np.zeros((len(action), 8), np.float32)
     state[:, 6:] = trajectory.states[:-1, 8:10]
     joints = np.zeros((len(action), 7), np.float32)
-    made = Episode("milk", {}, state, joints, action, action, "", {}, {})
+    made = Episode(trajectory.trajectory_id, {}, state, joints, action, action, "", {}, {})
+    commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
+    copy = Copy("rlds", replace(made, action=commanded), [], {}, {}, {})
+    return [fault.what for fault in CHECKS["gripper"](Case({}, made, trajectory, [copy], None))]
 
-    def found(sign: float) -> list[Fault]:
-        commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
-        copy = Copy("rlds", replace(made, action=commanded), [], {}, {}, {})
-        return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], None)))
 
-    assert found(1.0) == []
-    (flipped,) = found(-1.0)
-    assert "against the gripper's command" in flipped.what
-    assert "gripper command" in found(0.5)[0].what
+def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory]) -> None:
+    """On whole demonstrations: in the last second of one, fingers hardly move."""
+    for trajectory in whole.values():
+        assert found_of_gripper(trajectory) == []
+        (flipped,) = found_of_gripper(trajectory, sign=-1.0)
+        assert "against changes of the gripper's command" in flipped
+        assert "gripper command" in found_of_gripper(trajectory, sign=0.5)[0]
+
+
+def test_a_knob_may_move_the_fingers_against_the_command() -> None:
+    """From this posture the knob closes the open fingers, and then opens the closed ones."""
+    offsets_rad = (-0.225396, -0.001354, -0.137521, -0.274138, -0.095243, -0.016973, 0.075971)
+    posture = RobotPerturbation(component="controller_posture", level=4, joint_offsets_rad=offsets_rad)
+    environment = Environment(STOVE)
+    pressed = replay(environment, starter_demo(STOVE), "pressed", ReplayConfig(mode="open_loop"), [posture])
+    environment.close()
+    assert pressed.verdict.kept
+    gap_m, command = pressed.states[:, 8] - pressed.states[:, 9], pressed.actions[:, 6]
+    assert -(np.sign(command) * np.diff(gap_m)).sum() < -0.04, "all in all, the fingers move against the command"
+    assert found_of_gripper(pressed) == []
+    assert found_of_gripper(pressed, sign=-1.0) != []
 
 
 def record_as_written(data: Path) -> None:
