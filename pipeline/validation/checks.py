@@ -36,14 +36,15 @@ PALE_LEVELS = 4.0
 """Least colourfulness assumed of a frame: mean distance of Cb and Cr from grey, in levels, over 16 by 16 fields."""
 
 STILL_LEVELS = 0.5
-"""Mean difference in grey levels up to which two frames count as equal; the least of 49 episodes was 1.4."""
+"""Mean difference in grey levels up to which two frames count as equal; the least of 532 episodes was 1.2."""
 
 FAR_STILL_LEVELS = 0.1
 """``STILL_LEVELS`` of further views; in the gallery view, which is far from the robot, the least of seven episodes was
 0.6."""
 
 BLANK_LEVELS = 5.0
-"""Standard deviation in grey levels below which a frame counts as blank; the least was 27, in fog."""
+"""Standard deviation in grey levels below which a frame counts as blank; the least of 532 episodes, which
+have up to seven perturbed axes, was 19."""
 
 RESPONSE_STEPS = 8
 """Number of steps (0.4 s) in which the fingers respond to a change of the command.
