@@ -96,8 +96,9 @@ def table_of(policies: Sequence[TestedPolicy]) -> dict[str, Any]:
 def paper_table(policies: Mapping[str, Sequence[Scored]]) -> dict[str, Any]:
     """Compute the paper's table, with policies next to the published models; JSON-serialisable.
 
-    A balanced subset has as many easy tasks as hard tasks, unlike the benchmark. A task is therefore weighted by the
-    number of test tasks of its axis, component and level, divided by the number of these tasks with an episode. Parts
+    A balanced subset has as many easy tasks as hard tasks, and equally many of each suite, unlike the benchmark. A task
+    is therefore weighted by the number of test tasks of its axis, component, level and suite, divided by the number of
+    these tasks with an episode. Suites without an episode at a level are represented by the other suites. Other parts
     of the benchmark without an episode are left out of a column, and reported. The rate of a task with several episodes
     is their mean.
 
@@ -179,12 +180,14 @@ def _of_tests(outcomes: Mapping[tuple[str, str], Sequence[bool]]) -> Iterable[Te
 
 def _cell(outcomes: Sequence[TestOutcomes], axes: Sequence[str]) -> Estimate:
     """Estimate the success rate of a column from the outcomes of its test tasks with an episode."""
-    by_stratum = grouped((_stratum(test), successes) for test, successes in outcomes)
-    strata = {}
-    for stratum, tasks in by_stratum.items():
+    by_suite = grouped(((*_stratum(test), test.suite), successes) for test, successes in outcomes)
+    suites_of: dict[tuple[str, str, int], dict[tuple[str, str, int, str], Estimate]] = {}
+    for part, tasks in by_suite.items():
         rate = sum(sum(successes) / len(successes) for successes in tasks) / len(tasks)
         episodes = sum(map(len, tasks))
-        strata[stratum] = Estimate(episodes, len(tasks), rate, len(tasks), 0, 1)
+        suites_of.setdefault(part[:3], {})[part] = Estimate(episodes, len(tasks), rate, len(tasks), 0, 1)
+    sizes = _sizes(axes, 4)
+    strata = {stratum: _joined(suites, sizes) for stratum, suites in suites_of.items()}
     tests = [test for test, _ in outcomes]
     return replace(_joined(strata, _sizes(axes, 3)), absent=_absent(tests, axes))
 

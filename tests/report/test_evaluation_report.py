@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,28 @@ def test_all_tasks_of_a_column_weigh_the_same() -> None:
     assert line["cells"]["camera"]["rate"] == pytest.approx(133 / 1599)
     assert line["cells"]["camera"]["effective"] == pytest.approx(1599)
     assert line["cells"]["camera"]["absent"] == ""
+
+
+@pytest.mark.parametrize("number", [200, 1000])
+def test_a_balanced_subset_has_the_suites_shares(number: int) -> None:
+    """Of the pose tests of level 5, 185 of 291 are of the goal suite; a balanced subset has as many of each suite."""
+    every = select(Selection(source="libero_plus", axes=("pose",)))
+    some = select(Selection(source="libero_plus", subset=number))
+    for tasks in (every, [task for task in some if task.axis == "pose"]):
+        rows = [result(task, task.suite != "libero_goal", "mine") for task in tasks]
+        (line,) = paper_table({"mine": rows})["evaluated"]
+        assert line["cells"]["layout"]["rate"] == pytest.approx(511 / 696)
+
+
+def test_a_suite_without_an_episode_at_a_level_is_represented_by_the_others() -> None:
+    tests = [test for test in benchmark.load().on_axis("pose") if level_of_test(test) == 5]
+    sizes = Counter(test.suite for test in tests)
+    chosen = [next(test for test in tests if test.suite == suite) for suite in ("libero_goal", "libero_object")]
+    tasks = [EvaluationTask("libero_plus", one.suite, one.base, one.name, "pose", "scene", 5, 0) for one in chosen]
+    (line,) = paper_table({"mine": [result(task, task.suite == "libero_goal", "mine") for task in tasks]})["evaluated"]
+    share = sizes["libero_goal"] / (sizes["libero_goal"] + sizes["libero_object"])
+    assert line["cells"]["layout"]["rate"] == pytest.approx(share)
+    assert line["cells"]["layout"]["effective"] == pytest.approx(1 / (share**2 + (1 - share) ** 2))
 
 
 def test_a_total_weighs_each_column_by_its_tasks() -> None:
