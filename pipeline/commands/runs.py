@@ -95,7 +95,7 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     if the folder has no mark of a run, or if a folder to delete contains a file that no stage generated.
     """
     from pipeline.generated import edits_in_words
-    from pipeline.run import claim, cleaning, foreign
+    from pipeline.run import claim, cleaning
 
     run = open_run(config)
     claim.refuse_unmarked(run.folder)
@@ -108,10 +108,7 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     print(f"{sum(size_of_part.values()):10.1f} MB  in all, of {run.folder}")
     for edit in edits_in_words(run.folder) if "uploads" in size_of_part else ():
         print(edit)
-    names: list[str] = []
-    for part in size_of_part:
-        names += cleaning.PARTS[part].names
-    foreign.refuse_foreign_files(run.folder, names)
+    cleaning.refuse_foreign(run, size_of_part)
     if not yes:
         if not sys.stdin.isatty():
             raise PipelineError("nothing was deleted, because there is no terminal to ask in", remedy="add --yes")

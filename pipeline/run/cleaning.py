@@ -8,6 +8,7 @@ from pipeline.export_config import FAILURES
 from pipeline.files import remove
 from pipeline.formats.registry import GROUPS, formats_in
 from pipeline.run.claim import locked, refuse_unmarked
+from pipeline.run.export import refuse_unrecorded
 from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.layout import (
     CARD,
@@ -89,6 +90,19 @@ def found(run: Run, parts: Iterable[str]) -> dict[str, float]:
     return sizes_mb
 
 
+def refuse_foreign(run: Run, parts: Iterable[str]) -> None:
+    """Stop before parts are deleted that hold files of the user.
+
+    Raises:
+        PipelineError: naming files that no stage generated.
+    """
+    for part in parts:
+        refuse_foreign_files(run.folder, PARTS[part].names)
+        if part in GROUPS:
+            for folder in filter(Path.is_dir, map(run.path, PARTS[part].names)):
+                refuse_unrecorded(folder)
+
+
 def delete(run: Run, parts: Iterable[str]) -> None:
     """Delete parts of a run's folder.
 
@@ -98,12 +112,11 @@ def delete(run: Run, parts: Iterable[str]) -> None:
     """
     refuse_unmarked(run.folder)
     with locked(run.folder):
-        names: list[str] = []
-        for part in parts:
-            names += PARTS[part].names
-        refuse_foreign_files(run.folder, names)
-        for name in names:
-            remove(run.path(name))
+        chosen = [*parts]
+        refuse_foreign(run, chosen)
+        for part in chosen:
+            for name in PARTS[part].names:
+                remove(run.path(name))
 
 
 def size_mb(path: Path) -> float:

@@ -36,7 +36,7 @@ from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.identity import refuse_unasked
 from pipeline.record import Basis
-from pipeline.run.layout import DATASETS
+from pipeline.run.layout import DATASETS, WORK
 from pipeline.run.outcome import shuffled
 from pipeline.run.run import Run
 from pipeline.seeding import digest
@@ -111,6 +111,28 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
             where=foreign[0],
             expected=f"only {', '.join(sorted(sets))}",
             remedy=f"move it out of {target.folder}; to train on both, create a folder of links to both",
+        )
+
+
+def refuse_unrecorded(folder: Path) -> None:
+    """Stop before the folder of a format's datasets is deleted if it has files that no record of an export lists.
+
+    The format need not be requested.
+
+    Raises:
+        PipelineError: naming such a file, or the record if it is damaged.
+    """
+    recorded: set[str] = set()
+    for file in (folder.with_name(f"{folder.name}.json"), *(folder.parent / WORK / folder.name).glob(f"*/{FINISHED}")):
+        if file.is_file():
+            recorded |= read_json(file, "restore the file, or move the folder of the dataset elsewhere")["files"].keys()
+    foreign = [path for path in _files(folder) if path.relative_to(folder).as_posix() not in recorded]
+    if foreign:
+        raise PipelineError(
+            f"no record of an export lists the file, and it would be deleted ({len(foreign)} such files)",
+            where=foreign[0],
+            expected=f"only the files of {folder.name}.json",
+            remedy=f"move it out of {folder}",
         )
 
 

@@ -367,6 +367,30 @@ def test_clean_names_a_file_that_no_stage_made(
     assert theirs.read_bytes() == b"mine"
 
 
+@pytest.mark.parametrize("place", ["rlds/notes.txt", "lerobot_v21/mine/weights.bin", "failures/rlds/notes.txt"])
+@pytest.mark.parametrize("recorded", [True, False])
+def test_clean_names_a_file_that_no_export_recorded(
+    place: str, recorded: bool, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = claimed(Path("configs/tiny.yaml")).data
+    theirs = data / place
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"mine")
+    dataset = next(folder for folder in theirs.parents if folder.name in ("rlds", "lerobot_v21"))
+    (dataset / "data.bin").write_bytes(b"ours")
+    if recorded:
+        record = {"identity": "", "files": {"data.bin": "hash"}, "places": {}}
+        dataset.with_name(f"{dataset.name}.json").write_text(json.dumps(record))
+    monkeypatch.setattr(sys, "argv", ["pipeline", "clean", "--yes", "configs/tiny.yaml"])
+    assert command_line.main() == 1
+    assert "no record of an export lists the file" in capsys.readouterr().err
+    assert theirs.read_bytes() == b"mine"
+    if recorded:
+        theirs.unlink()
+        assert command_line.main() == 0
+        assert not dataset.exists()
+
+
 def test_clean_needs_a_mark_and_names_foreign_files(
     clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
