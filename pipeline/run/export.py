@@ -9,7 +9,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from importlib.metadata import version
@@ -102,9 +102,7 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
     sets |= {name.partition("/")[0] for name in recorded}
     foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in sets)
     if records and not foreign:
-        for path in _files(target.folder):
-            if path.relative_to(target.folder).as_posix() not in recorded:
-                foreign.append(path)
+        foreign = _unrecorded(target.folder, recorded)
     if foreign:
         raise PipelineError(
             f"the entry is not of this run's {target.title} and would be deleted ({len(foreign)} such entries)",
@@ -122,18 +120,27 @@ def refuse_unrecorded(folder: Path) -> None:
     Raises:
         PipelineError: naming such a file, or the record if it is damaged.
     """
+    record_file = folder.with_name(f"{folder.name}.json")
+    # Records in the work folder are of killed calls.
+    of_killed_calls = (folder.parent / WORK / folder.name).glob(f"*/{FINISHED}")
     recorded: set[str] = set()
-    for file in (folder.with_name(f"{folder.name}.json"), *(folder.parent / WORK / folder.name).glob(f"*/{FINISHED}")):
+    for file in (record_file, *of_killed_calls):
         if file.is_file():
-            recorded |= read_json(file, "restore the file, or move the folder of the dataset elsewhere")["files"].keys()
-    foreign = [path for path in _files(folder) if path.relative_to(folder).as_posix() not in recorded]
+            content = read_json(file, "restore the file, or move the folder of the dataset elsewhere")
+            recorded |= content.get("files", {}).keys()
+    foreign = _unrecorded(folder, recorded)
     if foreign:
         raise PipelineError(
             f"no record of an export lists the file, and it would be deleted ({len(foreign)} such files)",
             where=foreign[0],
-            expected=f"only the files of {folder.name}.json",
+            expected=f"only the files that {record_file} lists",
             remedy=f"move it out of {folder}",
         )
+
+
+def _unrecorded(folder: Path, recorded: Collection[str]) -> list[Path]:
+    """List the files of a dataset's folder whose paths in it are not in ``recorded``."""
+    return [path for path in _files(folder) if path.relative_to(folder).as_posix() not in recorded]
 
 
 def _files(folder: Path) -> list[Path]:

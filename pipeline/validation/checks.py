@@ -55,8 +55,7 @@ m in all."""
 AGAINST_M = 0.01
 """Sum of the distances that the fingers may move against the command in ``RESPONSE_STEPS`` after its changes.
 
-In each of 1,537 episodes with changes, of all 40 tasks, they moved 0.005 m or more with it, and 0.02 m or more in 99 %
-of them."""
+In each of 1,500 episodes with changes they moved 0.005 m or more with it, and 0.02 m or more in 99 % of them."""
 
 
 def _chroma(frame: Frame) -> NDArray[np.float64]:
