@@ -4,7 +4,7 @@ Configurations can name the axis after two changes: put both classes into a file
 its ``__init__.py``. CONTRIBUTING.md has the steps.
 """
 
-import sys
+import argparse
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -62,4 +62,6 @@ def main(run: Path) -> None:
 
 if __name__ == "__main__":
     ensure_fixed_machine_code()
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    main(parser.parse_args().run)

@@ -4,8 +4,8 @@ The run needs ``render: {extras: [depth, segmentation, object_poses]}``. For eac
 script prints the distance of its visible points from its recorded position.
 """
 
+import argparse
 import json
-import sys
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
@@ -52,4 +52,6 @@ def back_project(view: str, seen: Mapping[str, Array], metadata: Mapping[str, Ar
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    main(parser.parse_args().run)

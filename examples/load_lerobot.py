@@ -3,7 +3,7 @@
 A policy that predicts several actions at once gets them through ``delta_timestamps``, in seconds from the frame.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -35,4 +35,6 @@ def main(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    main(parser.parse_args().run)

@@ -6,7 +6,7 @@ as a checkout of OpenVLA, one line gives the same episodes as a ``tf.data.Datase
     dataset = tfds.builder_from_directory(folder).as_dataset(split="train")
 """
 
-import sys
+import argparse
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
@@ -47,4 +47,6 @@ def show(episode: Mapping[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    main(parser.parse_args().run)

@@ -4,8 +4,8 @@ The manifest has a row for every planned episode, kept or dropped. ``episode_id`
 ``schemas/manifest.json`` describes each column.
 """
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 import pandas as pd
@@ -34,4 +34,6 @@ def main(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    main(parser.parse_args().run)

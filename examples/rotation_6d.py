@@ -6,7 +6,7 @@ The 6D rotation of Zhou et al. (arXiv:1812.07035) is the first two columns of th
 The script prints the first absolute action of a LeRobot dataset in both forms.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -44,4 +44,6 @@ def main(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    main(parser.parse_args().run)

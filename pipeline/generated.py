@@ -132,6 +132,23 @@ def edits_in_words(data: Path) -> Iterator[str]:
             yield f"edited files in {data / name}: {words}. A run stops before it overwrites them: {REMEDY}"
 
 
+def refuse_edits(data: Path) -> None:
+    """Stop before the generated folders of a run are deleted with edits in them.
+
+    Raises:
+        PipelineError: naming the edited files of one folder.
+    """
+    for name in FOLDERS:
+        edits_of_folder = edits(data / name)
+        if edits_of_folder:
+            raise PipelineError(
+                f"{len(edits_of_folder)} edited files would be deleted: {in_words(edits_of_folder)}",
+                where=data / name,
+                expected=f"the files that {data / name / RECORD} lists, unchanged",
+                remedy="move these files to another folder; a run generates missing files again",
+            )
+
+
 def in_words(found: Mapping[str, str]) -> str:
     """Join paths and states, at most ``MAX_NAMED`` of them."""
     named = [f"{path} ({state})" for path, state in sorted(found.items())]

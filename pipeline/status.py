@@ -64,7 +64,9 @@ def told(run: Run) -> Iterator[str | Table]:
 
 
 def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict]) -> dict[str, counts.Target]:
-    results = [{"axis": row.axis, "wanted": row.wanted, "reason": judged[row.episode_id].reason} for row in rows]
+    """Count the episodes of the whole plan. Replays do not depend on ``export.where``."""
+    columns = [(row.axis, row.wanted, judged[row.episode_id].reason) for row in rows]
+    results = [{"axis": axis, "wanted": wanted, "reason": reason, "chosen": True} for axis, wanted, reason in columns]
     return counts.targets(results, config.plan.episodes)
 
 

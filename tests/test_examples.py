@@ -27,6 +27,16 @@ def kept(run: Path) -> list[dict[str, object]]:
     return [row for row in manifest.read(run / "manifest.parquet") if row["kept"]]
 
 
+@pytest.mark.parametrize(
+    "example", ["add_axis", "back_project", "load_lerobot", "load_rlds", "read_manifest", "rotation_6d"]
+)
+def test_an_example_without_a_folder_says_what_it_needs(example: str) -> None:
+    file = REPOSITORY / "examples" / f"{example}.py"
+    done = subprocess.run([sys.executable, file], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.endswith(f"{file.name}: error: the following arguments are required: run\n")
+
+
 def test_load_rlds(finished: Path) -> None:
     output = printed("load_rlds", finished)
     for suite, count in Counter(str(row["suite"]).removeprefix("libero_") for row in kept(finished)).items():

@@ -92,9 +92,9 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
 
     The command lists the parts, their sizes and the stages that generate them again, and then asks for permission.
     Other files in the folder of the run stay, and so do demonstrations, configurations and downloads. The command stops
-    if the folder has no mark of a run, or if a folder to delete contains a file that no stage generated.
+    if the folder has no mark of a run, or if a folder to delete contains a file that no stage generated or that was
+    edited.
     """
-    from pipeline.generated import edits_in_words
     from pipeline.run import claim, cleaning
 
     run = open_run(config)
@@ -106,8 +106,6 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     for part, size_mb in size_of_part.items():
         print(f"{size_mb:10.1f} MB  {part:<13} generated again by {cleaning.PARTS[part].made_by}")
     print(f"{sum(size_of_part.values()):10.1f} MB  in all, of {run.folder}")
-    for edit in edits_in_words(run.folder) if "uploads" in size_of_part else ():
-        print(edit)
     cleaning.refuse_foreign(run, size_of_part)
     if not yes:
         if not sys.stdin.isatty():

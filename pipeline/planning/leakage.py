@@ -149,7 +149,7 @@ def covered_by(
         kept: rows of the manifest.
         findings: content of ``leakage.json``.
     """
-    draws: dict[str, list[tuple[Perturbation, Task]]] = {axis: [] for axis in findings}
+    draws: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
     for row in kept:
         task = task_of(row["suite"], row["task"], row["perturbations"])
         for perturbation in from_json(row["perturbations"]):

@@ -22,11 +22,13 @@ from pipeline.formats.base import Format
 from pipeline.formats.episodes import Known, demos_for_validation
 from pipeline.generated import generated
 from pipeline.libero.tasks import SUITES
+from pipeline.planning import leakage
 from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, Diversity, diversity, named, origins, tally, targets, tried
 from pipeline.run.layout import CARD, FINETUNE, MANIFEST, SHEETS
 from pipeline.run.run import Run
+from pipeline.testset import benchmark
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """Files in the run's folder from which the card is generated, in addition to the manifest."""
@@ -61,6 +63,8 @@ def write(run: Run) -> None:
     rows, formats = run.manifest, run.formats
     settings = manifest.settings(run.manifest_file)
     reports = {name: read_json(run.path(name)) for name in REPORTS}
+    kept = [row for row in rows if row["kept"]]
+    reports["leakage.json"] = leakage.covered_by(kept, reports["leakage.json"], benchmark.load())
     clients = yaml.safe_load((run.path(FINETUNE) / RECIPE).read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)
     sheets = [axis for axis in axes if (run.path(SHEETS) / f"{axis}.png").is_file()]
@@ -110,7 +114,7 @@ def render(
         shown: the format.
         others: titles of the other formats.
         rows: the manifest.
-        reports: contents of the files of ``REPORTS``.
+        reports: contents of the files of ``REPORTS``, with the kept episodes' distances to the test tasks.
         clients: the section of that name in ``finetune.yaml``, which has the training command of each policy's code.
         sheets: the axes that have a picture.
         name: name of the dataset.
@@ -118,7 +122,7 @@ def render(
         episodes: ``plan.episodes``, empty if the manifest lacks it.
         publish: the publisher's statements.
     """
-    leakage, validation, statistics = (reports[report] for report in REPORTS)
+    distances, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
     owed = attributions(row["perturbations"] for row in kept)
     kept_suites = named(kept, "suite")
@@ -158,7 +162,7 @@ def render(
         axes=axes,
         sheets=sheets,
         yields=_yields(rows),
-        leakage={axis: finding for axis, finding in leakage.items() if axis in axes},
+        distances={axis: finding for axis, finding in distances.items() if axis in axes},
         schema=SCHEMA,
         statistics=statistics,
         validation=validation,

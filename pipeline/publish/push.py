@@ -268,7 +268,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
             f"the folder has {len(foreign)} foreign files and {len(linked)} links to files elsewhere, such as "
             f"{(foreign + linked)[0]}",
             where=root,
-            remedy=f"move them to another folder (training may write files), and `{MAKE_AGAIN}`",
+            remedy="move them to another folder (training may write files), and push again",
         )
     missing = sorted(wanted - files.keys())
     if missing:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from pipeline.export_config import FAILURES
 from pipeline.files import remove
 from pipeline.formats.registry import GROUPS, formats_in
+from pipeline.generated import refuse_edits
 from pipeline.run.claim import locked, refuse_unmarked
 from pipeline.run.export import refuse_unrecorded
 from pipeline.run.foreign import refuse_foreign_files
@@ -94,9 +95,11 @@ def refuse_foreign(run: Run, parts: Iterable[str]) -> None:
     """Stop before parts are deleted that hold files of the user.
 
     Raises:
-        PipelineError: naming files that no stage generated.
+        PipelineError: naming files that no stage generated, or that were edited.
     """
     for part in parts:
+        if part == "uploads":
+            refuse_edits(run.folder)
         refuse_foreign_files(run.folder, PARTS[part].names)
         if part in GROUPS:
             for folder in filter(Path.is_dir, map(run.path, PARTS[part].names)):
@@ -108,7 +111,7 @@ def delete(run: Run, parts: Iterable[str]) -> None:
 
     Raises:
         PipelineError: when the folder has no mark of a run, a stage of the run is running, or a part holds files that
-            no stage generated.
+            no stage generated, or edited files.
     """
     refuse_unmarked(run.folder)
     with locked(run.folder):

@@ -51,10 +51,11 @@ class Counts:
 
 @dataclass(frozen=True)
 class Target:
-    """Numbers of episodes of an axis or combination; episodes that ``export.where`` leaves out count too.
+    """Numbers of episodes of an axis or combination.
 
     Attributes:
-        wanted: the number in ``plan.episodes``; for ``clean``, the number of demonstrations.
+        wanted: the number in ``plan.episodes``; for ``clean``, the number of demonstrations. If ``export.where`` leaves
+            episodes out, the number of wanted episodes that it selects.
         planned: number of wanted episodes for which the plan has perturbations.
         kept: number of episodes that reached their goal and whose frames show enough.
     """
@@ -99,14 +100,18 @@ def diversity(rows: Rows) -> dict[str, Diversity]:
 
 
 def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
-    """Map each axis or combination to its target, ``clean`` first.
+    """Map each axis or combination of the selected rows to its target, ``clean`` first.
 
     Args:
+        rows: rows of the manifest, or their columns ``axis``, ``wanted``, ``chosen`` and ``reason``.
         episodes: ``plan.episodes``. For an axis that it lacks, the planned number counts as wanted.
     """
-    planned = Counter(row["axis"] for row in rows if row["wanted"])
-    kept = Counter(row["axis"] for row in rows if row["reason"] in MADE)
-    wanted = {axis: planned[axis] for axis in named(rows, "axis")} | dict(episodes)
+    selected = [row for row in rows if row["chosen"]]
+    planned = Counter(row["axis"] for row in selected if row["wanted"])
+    kept = Counter(row["axis"] for row in selected if row["reason"] in MADE)
+    wanted = {axis: planned[axis] for axis in named(selected, "axis")}
+    if len(selected) == len(rows):
+        wanted |= episodes
     return {axis: Target(number, planned[axis], kept[axis]) for axis, number in wanted.items()}
 
 

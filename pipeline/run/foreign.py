@@ -6,11 +6,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pipeline.axes import AXES
-from pipeline.clients.files import FILES
 from pipeline.errors import PipelineError
 from pipeline.files import is_temporary
-from pipeline.formats.registry import FORMATS
-from pipeline.run.layout import CARD, FINETUNE, FRAMES, PREVIEWS, SHEETS, TRAJECTORIES
+from pipeline.run.layout import FRAMES, PREVIEWS, SHEETS, TRAJECTORIES
 from pipeline.stores.store import EARLIER_SUFFIX, SUFFIX, TABLE
 
 _AXIS = rf"({'|'.join(AXES)})"
@@ -26,13 +24,6 @@ CLEARED = {
 }
 """Map of the folders that stages clear to a pattern of the paths that stages write in them."""
 
-MADE = {
-    **CLEARED,
-    CARD: rf"\.generated\.json|({'|'.join(kind.name for kind in FORMATS)})/(README\.md|SHA256SUMS|pictures/{_SHEET})",
-    FINETUNE: rf"\.generated\.json|__pycache__/[^/]+\.pyc|{'|'.join(map(re.escape, FILES))}",
-}
-"""``CLEARED`` with the folders whose stages look for edits themselves. ``clean`` deletes all of them."""
-
 SHOWN = 3
 """Number of files that an error names at most."""
 
@@ -45,7 +36,7 @@ def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) ->
 
     Args:
         data: the run's folder.
-        folders: keys of ``MADE``; other names are ignored.
+        folders: keys of ``CLEARED``; other names are ignored.
 
     Raises:
         PipelineError: naming some of the files.
@@ -57,15 +48,15 @@ def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) ->
         raise PipelineError(
             f"the folder contains files that no stage of this run generated, and that would be deleted: {names}{more}",
             where=data,
-            expected=f"only the run's own files in {', '.join(MADE)}",
+            expected=f"only the run's own files in {', '.join(CLEARED)}",
             remedy="move these files to another folder; files next to the listed folders are never deleted",
         )
 
 
 def foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> Iterator[Path]:
     """Yield the files and links in ``folders`` of a run's folder that no stage generated."""
-    for name in MADE.keys() & {*folders}:
-        pattern, folder = re.compile(MADE[name]), data / name
+    for name in CLEARED.keys() & {*folders}:
+        pattern, folder = re.compile(CLEARED[name]), data / name
         for entry in _entries(folder):
             path = entry.path[len(str(folder)) + 1 :]
             temporary = any(is_temporary(part) for part in path.split(os.sep))

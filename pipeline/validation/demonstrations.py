@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from glob import glob
 from pathlib import Path
@@ -11,6 +12,8 @@ from pipeline.axes.language_lint import too_long
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
+from pipeline.formats.hdf5.layout import VALIDATION_FOLDER
+from pipeline.libero.carried import IN_SCENE, task_named
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
 from pipeline.libero.starts import kept_actions
 from pipeline.libero.tasks import STEP_LIMITS, exceeds_step_limit, find_task, suites
@@ -60,6 +63,10 @@ def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayC
         raise PipelineError("there is no HDF5 file", where=root, expected=LAYOUT)
     result, jobs = CheckedDemos(len(files)), []
     for file in files:
+        unread = _unread(file, root)
+        if unread:
+            result.notes.append(f"{file}: {unread}")
+            continue
         try:
             task = _task_of(file, root)
             reject_test_tasks([task])
@@ -80,6 +87,19 @@ def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayC
                 remedy = "leave the task of one of the two out of demos.tasks"
                 result.faults.append(f"{entry.demo_id}: has the content of {first.demo_id}\n  try: {remedy}")
     return result
+
+
+def _unread(file: Path, root: Path) -> str | None:
+    """Return the reason why no run reads a file that an export in this layout wrote; `None` for other files."""
+    folder, *below = file.relative_to(root).parts
+    if folder == VALIDATION_FOLDER and len(below) == 2:
+        return f"no run with this demos.root reads it; check the validation part as a folder, {root / folder}"
+    name = file.name.removesuffix("_demo.hdf5")
+    if IN_SCENE in name and folder in suites() and len(below) == 1:
+        with suppress(PipelineError):
+            task_named(folder, name)
+            return "no run reads it, because it has episodes of a task in the scene of another"
+    return None
 
 
 def _task_of(file: Path, root: Path) -> Task:

@@ -49,6 +49,7 @@ def row(axis: str, *changes: Perturbation, task: Task = MILK, reason: str = "kep
         "kept": kept,
         "reason": reason,
         "chosen": True,
+        "wanted": True,
         "replay_mode": "open_loop",
         "steps": 100,
         "actions_sha256": "tracked" if other.get("replay_mode") == "tracked" else f"recorded {task.name}",
@@ -67,7 +68,7 @@ ROWS = [
     row("background", BACKGROUND),
     row("layout", LAYOUT, replay_mode="tracked"),
     row("layout", LAYOUT, task=STOVE, reason="goal_not_reached"),
-    row("layout", LAYOUT, task=STOVE, reason="reserve_not_needed", steps=None),
+    row("layout", LAYOUT, task=STOVE, reason="reserve_not_needed", steps=None, wanted=False),
     row("camera+background", CAMERA, BACKGROUND),
 ]
 COVERAGE = {"test_tasks": 313, "compared": 313, "smallest": 5.379, "median": 6.12, "p90": 7.34, "largest": 8.56}
@@ -85,6 +86,10 @@ def write_files(data: Path) -> None:
         "leakage.json": {
             "camera": FINDING
             | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint", "coverage": {"distance": COVERAGE}},
+            **{
+                axis: FINDING | {"measure": "equal or not", "overlaps": 0, "verdict": "disjoint", "coverage": {}}
+                for axis in ("background", "layout")
+            },
             # An axis of the plan without kept episodes.
             "robot": FINDING | {"measure": "radians", "overlaps": 0, "verdict": "disjoint", "coverage": {}},
         },

@@ -19,6 +19,7 @@ from conftest import BOWL, REPOSITORY, STOVE, limited, link_testset, run_stages,
 from pipeline import __main__ as command_line
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.generated import generated
 from pipeline.libero import hdf5
 from pipeline.planning import plan
 from pipeline.run.claim import LOCK, OWNER, claimed, locked, owned
@@ -329,10 +330,6 @@ FOREIGN = (
 )
 
 
-CLEAN_ALONE = ("card/rlds/LICENSE", "finetune/checkpoints/last/model.safetensors", "finetune/.env")
-"""What stages do not delete, and `clean` would."""
-
-
 @pytest.mark.parametrize("place", FOREIGN)
 def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone: Path) -> None:
     theirs = claimed(Path("configs/tiny.yaml")).data / place
@@ -354,7 +351,7 @@ def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
         run_stages(clone, yaml.safe_load(Path("configs/tiny.yaml").read_text()), ["inputs"])
 
 
-@pytest.mark.parametrize("place", [*FOREIGN, *CLEAN_ALONE])
+@pytest.mark.parametrize("place", FOREIGN)
 def test_clean_names_a_file_that_no_stage_made(
     place: str, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -365,6 +362,38 @@ def test_clean_names_a_file_that_no_stage_made(
     assert command_line.main() == 1
     assert f"would be deleted: {place}" in capsys.readouterr().err
     assert theirs.read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("state", ["added", "changed", "without a record"])
+@pytest.mark.parametrize("part", ["uploads", None])
+@pytest.mark.parametrize("place", ["card/rlds/LICENSE", "finetune/checkpoints/last/model.safetensors", "finetune/.env"])
+def test_clean_names_an_edited_file(
+    place: str,
+    part: str | None,
+    state: str,
+    clone: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    data = claimed(Path("configs/tiny.yaml")).data
+    edited, folder = data / place, data / place.partition("/")[0]
+    edited.parent.mkdir(parents=True)
+    if state != "without a record":
+        with generated(folder) as new:
+            (new / "generated.txt").write_text("ours")
+            if state == "changed":
+                (new / edited.relative_to(folder)).parent.mkdir(parents=True, exist_ok=True)
+                (new / edited.relative_to(folder)).write_text("ours")
+        edited.parent.mkdir(parents=True, exist_ok=True)
+    edited.write_bytes(b"mine")
+    only = ["--only", part] if part else []
+    monkeypatch.setattr(sys, "argv", ["pipeline", "clean", "--yes", *only, "configs/tiny.yaml"])
+    assert command_line.main() == 1
+    assert f"would be deleted: {edited.relative_to(folder)} ({state})" in capsys.readouterr().err
+    assert edited.read_bytes() == b"mine"
+    edited.rename(clone / "kept")
+    assert command_line.main() == 0
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("place", ["rlds/notes.txt", "lerobot_v21/mine/weights.bin", "failures/rlds/notes.txt"])

@@ -16,8 +16,8 @@ from pipeline.run.counts import Target, shortfalls, targets
 from pipeline.run.run import Run
 
 
-def row(axis: str, reason: str, *, wanted: bool = True) -> dict[str, Any]:
-    return {"axis": axis, "reason": reason, "wanted": wanted}
+def row(axis: str, reason: str, *, wanted: bool = True, chosen: bool = True) -> dict[str, Any]:
+    return {"axis": axis, "reason": reason, "wanted": wanted, "chosen": chosen}
 
 
 def test_one_of_two_wanted_pose_episodes_is_a_shortfall() -> None:
@@ -27,7 +27,7 @@ def test_one_of_two_wanted_pose_episodes_is_a_shortfall() -> None:
         row("pose", "kept"),
         row("pose", "goal_not_reached"),
         row("pose", "goal_lost", wanted=False),
-        row("camera", "left_out"),
+        row("camera", "kept"),
         row("light", "kept"),
     ]
     found = targets(rows, {"pose": 2, "camera": 1, "light": 3})
@@ -42,6 +42,22 @@ def test_one_of_two_wanted_pose_episodes_is_a_shortfall() -> None:
     assert "plan.reserve" in pose
     assert light.startswith("light: 1 of 3 wanted episodes are kept")
     assert "plan.reserve" not in light, "no candidate is left that reserves could add"
+
+
+def test_episodes_outside_the_dataset_are_neither_wanted_nor_kept() -> None:
+    rows = [
+        row("clean", "left_out", chosen=False),
+        row("pose", "kept"),
+        row("pose", "goal_not_reached"),
+        row("pose", "left_out", chosen=False),
+        row("pose", "goal_lost", chosen=False),
+        row("light", "left_out", chosen=False),
+        row("camera", "goal_not_reached"),
+        row("camera", "kept", wanted=False),
+    ]
+    found = targets(rows, {"pose": 4, "light": 1, "camera": 1})
+    assert found == {"pose": Target(2, 2, 1), "camera": Target(1, 1, 1)}
+    assert [sentence.partition(";")[0] for sentence in shortfalls(found)] == ["pose: 1 of 2 wanted episodes are kept"]
 
 
 @pytest.mark.slow

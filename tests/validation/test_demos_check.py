@@ -60,6 +60,24 @@ def test_good_files_pass_and_a_miss_beside_a_success_is_listed(good: Path) -> No
     assert checked(good, replays=1) == CheckedDemos(files=2, demonstrations=4, replayed=2)
 
 
+def test_the_other_files_of_an_export_are_noted(root: Path) -> None:
+    """Files for validation, and of tasks in the scenes of others, as an HDF5 export writes them. No run reads them."""
+    val = root / "val" / STOVE.suite / file_of(root, STOVE).name
+    val.parent.mkdir(parents=True)
+    shutil.copy(file_of(root, STOVE), val)
+    in_scene = file_of(root, STOVE).with_name(f"{STOVE.name}__in__{BOWL.name}_demo.hdf5")
+    misnamed = file_of(root, STOVE).with_name(f"{STOVE.name}__in__the_kitchen_demo.hdf5")
+    for file in (in_scene, misnamed):
+        shutil.copy(file_of(root, STOVE), file)
+    report = checked(root)
+    assert report.demonstrations == 4
+    assert [note.partition(": ")[0] for note in report.notes] == [str(in_scene), str(val)]
+    assert f"check the validation part as a folder, {root / 'val'}" in report.notes[1]
+    (fault,) = report.faults
+    assert fault.startswith(f"{misnamed}: libero_goal has no task")
+    assert checked(root / "val").demonstrations == 2
+
+
 def test_a_file_of_which_all_miss_is_a_fault(root: Path) -> None:
     with h5py.File(file_of(root, STOVE), "r+") as file:
         del file["data/demo_0"]

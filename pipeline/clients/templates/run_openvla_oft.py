@@ -16,6 +16,8 @@ A checkpoint that was trained on LIBERO and saved at STEP in the folder CHECKPOI
 OFT loads the checkpoint's action head only with ``--resume``. The head gives actions in units of the checkpoint's own
 statistics; with different statistics, equal outputs would be different movements. Warm-up and cosine run from STEP to
 the last step. Without ``--statistics``, these datasets' statistics are used, and a resumed run continues its cosine.
+OFT saves a checkpoint at multiples of ``--save_freq``, by default 10000, and not at the last step. Therefore choose
+``STEP+N`` or ``--save_freq`` so that the last step is a multiple.
 
 To train on LIBERO's datasets too, link both into one folder, and name each of LIBERO's datasets with its weight. OFT
 multiplies each weight by the dataset's number of steps. The datasets of this run have the weight 1:
