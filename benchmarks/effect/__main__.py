@@ -7,7 +7,7 @@
 
 Each step first runs the missing steps before it. Experiments with held-out perturbations generate the data of all arms
 before an evaluation. After a stop, the same command resumes. Policies can be trained on different machines: the results
-of a policy are one file, to be committed. docs/effect.md reports the costs.
+of a policy are one file, to be committed, which also states the CPU time of each part.
 """
 
 import argparse

@@ -22,6 +22,9 @@ LOG = Path(__file__).resolve().parents[1] / "LOG.md"
 FURTHER = Path(__file__).with_name("further") / "results"
 """Folder with one subfolder of results for each further experiment."""
 
+SHOWN = "axes"
+"""The further experiment whose tables and plot docs/effect.md shows, because it has all axes."""
+
 BESIDE = {"starts": "no_state", "goals_many": "goals", "axes_relative": "axes"}
 """Further experiment to a second one whose arms join its table: both share policies, tests and demonstrations."""
 
@@ -302,7 +305,7 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 3), layout="constrained")
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
     axes = figure.add_subplot()
     arms = arms_of(results)
     for place, arm in enumerate(arms):
@@ -317,8 +320,8 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
             axes.errorbar(x, height, spread, color="black", linewidth=0.8)
             each = [100 * success_rate(rows)["rate"] for rows in seeds.values()]
             axes.plot([x] * len(each), each, "o", color="black", markersize=2.5)
-    named = [LINES[line] for line in lines_of(results)]
-    axes.set_xticks(range(len(named)), named)
+    named = [LINES[line].replace(", ", ",\n") for line in lines_of(results)]
+    axes.set_xticks(range(len(named)), named, fontsize="small")
     axes.set_ylabel("success (%)")
     axes.set_ylim(0, 100)
     figure.legend(loc="outside upper center", ncols=len(arms), frameon=False)
@@ -327,17 +330,23 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
 
 
 def publish(folder: Path, docs: Path = DOCS, log: Path = LOG) -> str:
-    """Write the table of a folder's results into docs/effect.md, and the plot next to it; return the table.
+    """Write the tables and the plot of ``SHOWN`` into docs/effect.md, and those of all others into benchmarks/LOG.md.
 
-    The tables of the further experiments go into benchmarks/LOG.md.
+    Args:
+        folder: results of the first experiment.
+
+    Returns:
+        The tables in docs/effect.md.
     """
-    results = read(folder)
-    text = markdown(results) + "\n![success by tests and arm](effect.svg)\n"
-    plot(results, docs / "effect.svg")
+    shown = read(FURTHER / SHOWN)
+    text = markdown(shown) + "\n![success by tests and arm](effect.svg)\n"
+    plot(shown, docs / "effect.svg")
     _write(docs / "effect.md", "table", text)
+    _write(log, "experiment", markdown(read(folder)))
     for further in sorted(FURTHER.iterdir()):
-        joined = read(FURTHER / BESIDE[further.name]) if further.name in BESIDE else []
-        _write(log, further.name, markdown([*joined, *read(further)]))
+        if further.name != SHOWN:
+            joined = read(FURTHER / BESIDE[further.name]) if further.name in BESIDE else []
+            _write(log, further.name, markdown([*joined, *read(further)]))
     return text
 
 

@@ -22,6 +22,7 @@ from pipeline.formats.lerobot import LeRobot, LeRobotOpenpi, LeRobotV21, LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.rlds_layout import dataset_of, split_of
 from pipeline.generated import generated
+from pipeline.libero.tasks import SUITES
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -90,22 +91,27 @@ def build(
         oft_validates = bool(validating) and validating == {*suites.values()}
     if lerobot is not None:
         dataset["lerobot"] = sourced(lerobot.name, "the run's configuration, export.lerobot.name")
-    sections = _training_and_clients(export, oft_validates, rewrite_probability, content)
+    own_suites = sorted(counts.keys() - {*SUITES})
+    tested = [f"--suite {suite}" for suite in sorted(counts)] + ["--own-step-limit N"] if own_suites else []
+    sections = _training_and_clients(export, oft_validates, rewrite_probability, content, tested)
     return {"name": (rlds or export).name, "dataset": dataset, **sections}
 
 
 def _training_and_clients(
-    export: ExportConfig, oft_validates: bool, rewrite_probability: float, content: Content
+    export: ExportConfig, oft_validates: bool, rewrite_probability: float, content: Content, tested: Sequence[str]
 ) -> dict[str, Any]:
     """Return the recipe's sections on training and clients, from the template ``recipe.yaml.j2``.
 
     Clients whose format is not exported are listed with the setting that exports it.
+
+    Args:
+        tested: options of ``evaluate`` with the tasks to test; empty for its default, LIBERO's four suites.
     """
     cameras = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), 1)}
     values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
-    values |= {"rewrite_probability": rewrite_probability}
+    values |= {"rewrite_probability": rewrite_probability, "tested": tested}
     values |= {"inputs": _evaluated_inputs(export, content)}
     values |= {"robomimic_config": ROBOMIMIC_CONFIG}
     values |= {"ipec_set": _v21_of(export, "ipec"), "openpi_set": _v21_of(export, "openpi")}

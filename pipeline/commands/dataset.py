@@ -86,6 +86,11 @@ def audit(dataset: Path, manifest: Path | None) -> int:
 
     result = audit.audit(dataset, benchmark.load(), manifest)
     rich.print(leakage.report(result.axes))
+    if result.without_task:
+        print(
+            f"{result.without_task:,} of {result.episodes:,} episodes are of no task of LIBERO; for your own tasks, "
+            "run in the folder that has tasks/"
+        )
     for axis, number in result.unknown.items():
         print(f"{axis}: unknown for {number:,} of {result.episodes:,} episodes, without labels, text or a known task")
     print(json.dumps(asdict(result) | {"unknown": result.unknown}))

@@ -79,7 +79,7 @@ def expand(out: Path, per_task: int, tasks: tuple[str, ...], starts: Literal["wi
     The human demonstration is replayed from other starts. Replays that reach the goal are written to
     DIR/<suite>/<task>_demo.hdf5, in LIBERO's own layout (states, actions and scenes; no images). The files and all
     datasets generated from them mark the demonstrations as expanded. The command needs no network, and resumes when it
-    is called again. The last line of the output is JSON.
+    is called again. It stops if files have demonstrations that it would delete. The last line of the output is JSON.
     """
     from pipeline.compute.pool import runner
     from pipeline.compute_config import ComputeConfig

@@ -13,6 +13,7 @@ from pipeline.evaluation.policies import VIEWS
 from pipeline.evaluation.simulator import SETTLING_STEPS, Simulator
 from pipeline.evaluation.tasks import libero_states
 from pipeline.images.jpeg import to_policy
+from pipeline.libero.tasks import SUITES
 from pipeline.physics.environment import DUMMY_ACTION
 from pipeline.rendering.geometry import Instances
 from pipeline.rendering.renderer import LastScene, Renderer
@@ -130,8 +131,16 @@ def first_start(task: Task, number: int) -> Start:
     """Return the start of an evaluation in LIBERO's initial state with a number.
 
     Raises:
-        PipelineError: if LIBERO has no such state.
+        PipelineError: if LIBERO has no such state, or the task is not LIBERO's.
     """
+    if task.suite not in SUITES:
+        raise PipelineError(
+            "only LIBERO's tasks have initial states to compare with",
+            where=str(task),
+            expected=f"a task of {', '.join(SUITES)}",
+            remedy="compare a frame of a LIBERO task from the same code: rotation, size and colours do not depend on "
+            "the task",
+        )
     count = len(libero_states(task))
     if not 0 <= number < count:
         raise PipelineError(

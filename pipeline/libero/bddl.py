@@ -21,6 +21,9 @@ _PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
 _LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
 
 
+ARGUMENTS = {"on": 2, "in": 2, "open": 1, "close": 1, "turnon": 1, "turnoff": 1}
+"""Predicate of a goal to its number of arguments."""
+
 REGION_WORDS = {"cookies": "box", "flat_stove": "stove", "glazed_rim_porcelain_ramekin": "ramekin"}
 """Category to the other word that the names of LIBERO's regions use for it."""
 
@@ -306,7 +309,7 @@ def parse(text: str, where: object) -> Bddl:
             )
         _, (_, problem), *rest = tokens
         sections: dict[str, Any] = {name: content for name, *content in rest}
-        return Bddl(
+        definition = Bddl(
             problem=problem,
             language=" ".join(sections[":language"]),
             regions=dict(_regions(sections.get(":regions", []))),
@@ -316,6 +319,8 @@ def parse(text: str, where: object) -> Bddl:
             start=tuple(map(_fact, sections[":init"])),
             goal=_goal(sections[":goal"][0]),
         )
+        _check(definition, where)
+        return definition
     except PipelineError:
         raise
     except KeyError as error:
@@ -399,6 +404,37 @@ def _goal(expression: Any) -> tuple[Fact, ...]:
     """Return the facts of a goal: one fact, or a conjunction of facts."""
     facts = expression[1:] if expression[0] == "and" else [expression]
     return tuple(map(_fact, facts))
+
+
+def _check(definition: Bddl, where: object) -> None:
+    """Check goal and names of a definition.
+
+    Raises:
+        PipelineError: when the goal has no fact, a predicate that LIBERO cannot check, or a wrong number of arguments;
+            or when a name belongs to no declared object or fixture.
+    """
+    if not definition.goal:
+        raise PipelineError("the goal is empty", where=where, expected="at least one fact in :goal")
+    for predicate, *arguments in definition.goal:
+        if ARGUMENTS.get(predicate) != len(arguments):
+            known = ", ".join(f"{name} ({number})" for name, number in ARGUMENTS.items())
+            raise PipelineError(
+                f"the goal has the fact ({predicate} {' '.join(arguments)})",
+                where=where,
+                expected=f"one of these predicates, with its number of arguments: {known}",
+            )
+    named: dict[str, set[str]] = {":obj_of_interest": {*definition.of_interest}, ":init": set(), ":goal": set()}
+    for section, facts in ((":init", definition.start), (":goal", definition.goal)):
+        for _, *arguments in facts:
+            named[section].update(arguments)
+    for section, names in named.items():
+        for name in sorted(names):
+            if definition.owner(name) is None:
+                raise PipelineError(
+                    f"{section} names {name!r}, which the file does not declare",
+                    where=where,
+                    expected=f"{', '.join(definition.things)}, the working surface, or a region of these",
+                )
 
 
 def _fact(expression: Any) -> Fact:

@@ -271,11 +271,14 @@ class HDF5Source:
                     expected="recordings in scenes that the benchmark does not test",
                     remedy="leave its task out of demos.tasks: a policy that is trained on it cannot be tested",
                 )
-            if recorded != task.name and _is_task(recorded):
+            suites_of_recorded = _suites_with(recorded)
+            if recorded != task.name and suites_of_recorded:
+                suite = task.suite if task.suite in suites_of_recorded else suites_of_recorded[0]
                 raise PipelineError(
                     f"the file is named after one task but was recorded for another, {recorded!r} (bddl_file_name)",
                     where=path,
-                    remedy=f"rename the file to {recorded}_demo.hdf5",
+                    remedy=f"move the file to {self.root / suite / recorded}_demo.hdf5; if it is a recording of "
+                    f"{task.name}, correct bddl_file_name in a copy",
                 )
             reject_other_control(data, f"{path} data")
             yield data
@@ -385,13 +388,9 @@ class _Recorded(NamedTuple):
         return Demo(*self[:4], content.hexdigest(), executed, states[0].copy(), all_states, model_xml)
 
 
-def _is_task(name: str) -> bool:
-    """Return whether any suite has a task of this name."""
-    for suite in suites():
-        names = [task.name for task in tasks(suite)]
-        if name in names:
-            return True
-    return False
+def _suites_with(name: str) -> list[str]:
+    """List the suites that have a task of this name."""
+    return [suite for suite in suites() if any(task.name == name for task in tasks(suite))]
 
 
 def _outside(data: h5py.Group, key: str, where: str) -> int:

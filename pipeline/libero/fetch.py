@@ -49,6 +49,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         listed = HfApi(endpoint, token=False).dataset_info(REPOSITORY, revision=REVISION, files_metadata=True)
         stated = {file.rfilename: file for file in listed.siblings or ()}
         _refuse_other_files(out, wanted, stated)
+        present = [name for name in wanted if (out / name).exists()]
         snapshot_download(
             REPOSITORY,
             repo_type="dataset",
@@ -65,15 +66,13 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         raise PipelineError(
             f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
         ) from error
-    stated_bytes = {name: file.size for name, file in stated.items()}
-    present_bytes = {name: (out / name).stat().st_size for name in wanted if (out / name).is_file()}
-    missing = []
-    for name in wanted:
-        if name not in present_bytes or present_bytes[name] != stated_bytes.get(name):
-            missing.append(name)
-    if missing:
+    damaged = [name for name in wanted if name not in present and not _is_copy(out / name, stated.get(name))]
+    for name in damaged:
+        (out / name).unlink(missing_ok=True)  # Otherwise the next call would take it for the user's.
+    if damaged:
         raise PipelineError(
-            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} are missing or incomplete, such as {missing[0]}",
+            f"{len(damaged)} of {len(wanted)} files of {REPOSITORY} are missing there or arrived damaged, such as "
+            f"{damaged[0]}",
             where=out,
             remedy=remedy,
         )

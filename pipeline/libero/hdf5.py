@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import h5py
 import numpy as np
@@ -51,6 +51,9 @@ They hold the id and the content hash of its direct source, and the content hash
 origin.
 """
 
+EXPANDED_BY = "expanded_by"
+"""Attribute of a demonstration with the name and version of the program whose expansion wrote it."""
+
 FRAME_PX = 128
 """Height and width of the frames in LIBERO's files."""
 
@@ -63,6 +66,13 @@ COMPRESSION: Mapping[str, Any] = {"compression": "gzip", "compression_opts": 1}
 # LIBERO's longest demonstrations have about 500 steps. Without a limit, a few bytes of header could request all memory.
 _MAX_NUMBERS = 10_000_000
 _Node = TypeVar("_Node", h5py.Group, h5py.Dataset)
+
+
+class Expanded(NamedTuple):
+    """The start of an expanded demonstration: JSON of its perturbations, and the seed of the reset, if it is one."""
+
+    perturbations: str
+    reset_seed: str | None
 
 
 @contextmanager
@@ -307,13 +317,19 @@ def origin_sha256(group: h5py.Group) -> str | None:
     return None
 
 
-def expanded(file: Path) -> list[bool]:
-    """Return for each demonstration of a file whether an expansion generated it.
+def expansions(file: Path) -> list[Expanded | None]:
+    """Return the expansion of each demonstration of a file; `None` for a demonstration that no expansion wrote.
+
+    An exported episode of an expanded demonstration has the attribute ``EXPANDED_FROM`` too, but not ``EXPANDED_BY``.
 
     Raises:
         PipelineError: when the file does not have LIBERO's layout.
     """
+    found: list[Expanded | None] = []
     with opened(file) as content:
         data = member(content, "data", h5py.Group, str(file))
-        groups = [member(data, key, h5py.Group, f"{file} data/{key}") for key in names(data, str(file))]
-        return [EXPANDED_FROM in group.attrs for group in groups]
+        for key in names(data, str(file)):
+            attrs = member(data, key, h5py.Group, f"{file} data/{key}").attrs
+            written = EXPANDED_BY in attrs
+            found.append(Expanded(str(attrs.get("perturbations")), attrs.get("reset_seed")) if written else None)
+    return found

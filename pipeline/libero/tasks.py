@@ -71,7 +71,11 @@ def tasks(suite: str) -> tuple[Task, ...]:
     if suite in SUITES:
         return _listed(suite)
     if suite not in suites():
-        raise PipelineError(f"unknown suite {suite!r}", expected=" or ".join(suites()))
+        raise PipelineError(
+            f"unknown suite {suite!r}",
+            expected=" or ".join(suites()),
+            remedy=f"if it is a suite of your own, run in the folder that has {OWN / suite}",
+        )
     files = sorted((OWN / suite).absolute().glob("*.bddl"))
     own_tasks = tuple(Task(suite, file.stem, bddl.read(file).language, file) for file in files)
     for task in own_tasks:
@@ -176,9 +180,13 @@ def select_tasks(patterns: Iterable[str]) -> list[Task]:
     Raises:
         PipelineError: when a pattern matches no task.
     """
+    patterns = tuple(patterns)
+    # A faulty file of an own suite must not stop commands about other suites.
+    of_suites = [pattern.partition("/")[0] if "/" in pattern else "*" for pattern in patterns]
     by_name: dict[str, Task] = {}
     for suite in suites():
-        by_name |= {str(task): task for task in tasks(suite)}
+        if suite in SUITES or any(fnmatch.fnmatch(suite, pattern) for pattern in of_suites):
+            by_name |= {str(task): task for task in tasks(suite)}
     chosen: set[str] = set()
     for pattern in patterns:
         matched = fnmatch.filter(by_name, pattern)

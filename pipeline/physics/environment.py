@@ -203,13 +203,17 @@ class Environment:
         """Check the names that are looked up later and that LIBERO's own reset has not looked up.
 
         Raises:
-            UnusableSceneError: ``scene_refused`` if the model lacks a camera, joint or working surface.
+            UnusableSceneError: ``scene_refused`` if the model lacks a camera, a joint, a region of the goal, or a
+                working surface.
         """
         env, model = self._env.env, self._env.env.sim.model
         names_by_needed = {view.camera: model.camera_names for view in SCHEMA.views.values()}
         for thing in env.objects_dict.values():
             for joint in thing.joints:
                 names_by_needed[joint] = model.joint_names
+        for _, *arguments in self._goal or env.parsed_problem["goal_state"]:
+            regions = [name for name in arguments if env.object_states_dict[name].object_state_type == "site"]
+            names_by_needed |= dict.fromkeys(regions, model.site_names)
         missing = [needed for needed, names in names_by_needed.items() if needed not in names]
         if not set(SURFACES) & set(model.body_names):
             missing.append(" or ".join(SURFACES))

@@ -151,8 +151,8 @@ def covered_by(
     """
     draws: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
     for row in kept:
-        task = task_of(row["suite"], row["task"], row["perturbations"])
         for perturbation in from_json(row["perturbations"]):
+            task = task_of(row["suite"], row["task"], row["perturbations"])
             draws[perturbation.axis].append((perturbation, task))
     covered = {}
     for axis, finding in findings.items():

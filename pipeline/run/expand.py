@@ -7,6 +7,7 @@ files and datasets mark them as expanded.
 
 from __future__ import annotations
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import remove
 from pipeline.grouping import grouped
-from pipeline.identity import DISTRIBUTION, refuse_unasked
+from pipeline.identity import DISTRIBUTION, REMAKE, refuse_unasked
 from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
@@ -77,15 +78,15 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
 
     A candidate is kept if it reaches the goal, moves about as smoothly as the human, and has another start than the
     candidates before it. Replays are stored in ``<out>/.replays``, so that a stopped expansion resumes. The files of an
-    earlier expansion are replaced, or deleted if a task gets no demonstration.
+    earlier expansion are replaced. If they have demonstrations that the new files lack, this needs ``REMAKE=1``.
 
     Args:
         demos: demonstrations that the candidates perturb.
         rows: plan of ``candidates`` or ``resets`` for the same ``per_task``.
 
     Raises:
-        PipelineError: when a demonstration cannot be read, finished replays would be generated again without
-            permission, or a file of other demonstrations would be replaced.
+        PipelineError: when a demonstration cannot be read, finished replays would be generated again or expanded
+            demonstrations be deleted without permission, or a file of other demonstrations would be replaced.
     """
     file_of = {entry.task: out / entry.task.suite / f"{entry.task.name}_demo.hdf5" for entry in demos.index().entries}
     for file in file_of.values():
@@ -106,6 +107,8 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     result = Expansion(dropped=Counter(reason for reason in reasons if reason not in not_dropped))
     by_task = grouped((f"{row.suite}/{row.task}", row) for row in kept)
     for task, file in file_of.items():
+        _refuse_loss(file, by_task.get(str(task), []))
+    for task, file in file_of.items():
         rows_of_task = by_task.get(str(task), [])
         if len(rows_of_task) < per_task:
             result.short[str(task)] = per_task - len(rows_of_task)
@@ -121,14 +124,41 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
 def _refuse_other_demonstrations(file: Path) -> None:
     if not file.exists():
         return
-    expanded = hdf5.expanded(file)
-    if not expanded or not all(expanded):
+    expanded = hdf5.expansions(file)
+    if not expanded or None in expanded:
         raise PipelineError(
             "the file contains demonstrations that no expansion generated, and would be replaced",
             where=file,
             expected="no file, or a file of an earlier expansion",
             remedy="expand into another folder",
         )
+
+
+def _refuse_loss(file: Path, rows: Sequence[plan.Row]) -> None:
+    """Stop before demonstrations of an earlier expansion are deleted, unless ``REMAKE=1`` allows it.
+
+    Args:
+        rows: rows of the demonstrations to write.
+    """
+    if not file.exists():
+        return
+    lost = {*hdf5.expansions(file)} - {hdf5.Expanded(row.perturbations, _reset_seed(row)) for row in rows}
+    if not lost:
+        return
+    if os.environ.get(REMAKE) == "1":
+        print(f"replaced {len(lost)} demonstrations in {file}")
+        return
+    raise PipelineError(
+        f"{len(lost)} demonstrations of an earlier expansion would be deleted",
+        where=file,
+        expected="the options of the earlier call, or a larger --per-task that keeps all of its demonstrations",
+        remedy=f"expand into another folder, or put `{REMAKE}=1` before the command",
+    )
+
+
+def _reset_seed(row: plan.Row) -> str | None:
+    """Return the seed of a row's reset as the file has it; `None` for a start that is no reset."""
+    return None if row.reset_seed is None else str(row.reset_seed)
 
 
 def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
@@ -241,10 +271,10 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
             hdf5.EXPANDED_FROM: row.demo_id,
             hdf5.EXPANDED_FROM_SHA256: row.demo_sha256,
             hdf5.ORIGIN_SHA256: row.demo_origin_sha256,
-            "expanded_by": f"{DISTRIBUTION} {version(DISTRIBUTION)}",
+            hdf5.EXPANDED_BY: f"{DISTRIBUTION} {version(DISTRIBUTION)}",
             "perturbations": row.perturbations,
             "resolved": trajectory.resolved,
             "replay_mode": trajectory.mode,
-            **({} if row.reset_seed is None else {"reset_seed": str(row.reset_seed)}),
+            **({} if row.reset_seed is None else {"reset_seed": _reset_seed(row)}),
         },
     )

@@ -29,7 +29,7 @@ from pipeline.formats.lerobot.columns import EPISODE_ID, camera_column
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
-from pipeline.libero.tasks import find_task, tasks
+from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning.leakage import AxisDistance, Compared
 from pipeline.planning.leakage import check as compare
 from pipeline.tables import read_table
@@ -68,7 +68,7 @@ class Audit:
         axes: axis to the distance of its episodes from the test tasks.
         unlabelled: number of episodes without labels, which show only their instruction and camera.
         without_camera: number of unlabelled episodes without the camera's matrices.
-        without_task: number of episodes that match no task of this project.
+        without_task: number of episodes that match no task of LIBERO and of the folder ``tasks``.
         without_instruction: number of episodes without an instruction to compare.
         unplaced: axis to the number of episodes that it perturbs but that match no task, so they cannot be compared.
     """
@@ -115,7 +115,7 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
     unlabelled = [episode for episode in episodes if episode.perturbations is None]
     unplaced: Counter[str] = Counter()
     for episode in without_task:
-        unplaced.update(label.axis for label in _labels(episode) if _needs_task(label))
+        unplaced.update(_not_comparable(episode))
     return Audit(
         episodes=len(episodes),
         axes=compare(rows, test),
@@ -212,7 +212,9 @@ def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
 def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
     """Describe an episode in the axes' parameters, as far as it shows them, or else by its labels."""
     perturbations = [p for p in _labels(episode) if task is not None or not _needs_task(p)]
-    if episode.extrinsics is not None:
+    # The labels name a task that no test task is of, and that is not defined here.
+    unknown = task is None and _of_another_suite(episode)
+    if episode.extrinsics is not None and not unknown:
         perturbations = [p for p in perturbations if AXES[p.axis].audited != "cameras"]
         arenas = list(ARENAS) if task is None else [bddl.read(task.bddl_file).arena]
         cameras = [moved_to(episode.extrinsics, arena) for arena in arenas]
@@ -221,7 +223,7 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
             perturbations.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
     text = episode.instruction
     rewrites = []
-    if text is not None and (task is None or normalise(text) != normalise(task.instruction)):
+    if text is not None and not unknown and (task is None or normalise(text) != normalise(task.instruction)):
         rewrites = [LanguagePerturbation(component="paraphrase", level=1, text=text)]
     if task is None:
         # Without a task, the episode is compared with the task whose test instructions are nearest.
@@ -239,6 +241,19 @@ def _labels(episode: StoredEpisode) -> list[Perturbation]:
 def _needs_task(perturbation: Perturbation) -> bool:
     """Return whether the perturbation is compared only with the test tasks of one task or scene."""
     return perturbation.same is not None
+
+
+def _of_another_suite(episode: StoredEpisode) -> bool:
+    """Return whether the labels name a suite that is not LIBERO's."""
+    return bool(episode.suite) and episode.suite not in SUITES
+
+
+def _not_comparable(episode: StoredEpisode) -> Iterator[str]:
+    """Yield the axes of an episode's labels that cannot be compared with test tasks, as its task is not known here."""
+    shown = {label.axis for label in _labels(episode)}
+    for label in from_json(episode.perturbations or "[]"):
+        if _needs_task(label) if label.axis in shown else _of_another_suite(episode):
+            yield label.axis
 
 
 def _task_of(episode: StoredEpisode) -> Task | None:

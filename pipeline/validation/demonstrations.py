@@ -155,6 +155,10 @@ class _FileJob:
             return {entry: job().reason for entry, job in zip(entries, jobs, strict=True)}
 
     def _not_replayed(self, entry: DemoEntry, reason: str) -> str:
+        if reason == "goal_at_start":
+            what = "the goal holds before the first action, so every replay would count as a success"
+            expected = "a goal that the demonstration's actions reach"
+            return str(PipelineError(what, where=self._place(entry), expected=expected))
         expected = "a demonstration recorded with this LIBERO version, or with its model_file"
         return str(
             PipelineError(

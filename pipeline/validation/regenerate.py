@@ -115,6 +115,8 @@ def _rebuild(
             "the demonstration is not the one that the episode was generated from",
             where=row["demo_id"],
             expected=f"content with the hash {row['demo_sha256']}",
+            remedy="use the publisher's file of the demonstration; for a task of the publisher's own, also the BDDL "
+            "file, which is part of this hash",
         )
     trajectories, frames = out / TRAJECTORIES, out / FRAMES
     planned, planned_twin = _plan_row(row), _plan_row(twin)

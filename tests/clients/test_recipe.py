@@ -189,6 +189,22 @@ def test_the_evaluation_of_each_trained_policy_is_understood_by_both_programs(tm
     assert f"--args.chunk_size {chunk}" in evaluated["openvla_oft"]["server"]
 
 
+def test_policies_of_own_tasks_are_evaluated_on_these(tmp_path: Path) -> None:
+    """By default, ``evaluate`` tests LIBERO's four suites, and it has no step limit for others."""
+    export = export_config(lerobot_openpi={"name": NAME, "validation": 0.1})
+    tiny_recipe(tmp_path, export)
+    rows = [{**row, "suite": "table"} if row["suite"] == "libero_spatial" else row for row in ROWS]
+    recipe = build(tmp_path / "manifest.parquet", rows, export)
+    jsonschema.validate(recipe, json.loads(schema_file("finetune.json").read_text()))
+    for name, client in recipe["clients"].items():
+        if "evaluate" in client:
+            words = shlex.split(client["evaluate"]["command"].replace("--own-step-limit N", "--own-step-limit 150"))
+            suites = ("SUITE",) if name == "openvla_oft" else ("libero_10", "table")
+            assert [words[k + 1] for k, word in enumerate(words) if word == "--suite"] == [*suites], name
+            assert words[words.index("--own-step-limit") + 1] == "150"
+    assert "N is the number of control steps" in recipe["evaluation"]["own_tasks"]
+
+
 @pytest.mark.parametrize("client", ["lerobot_act", "lerobot_smolvla", "lerobot_pi05"])
 def test_pypi_has_the_extras_that_a_client_needs(client: str, tmp_path: Path) -> None:
     """pip only warns of a missing extra. An extra of lerobot's repository has an address after it."""

@@ -156,6 +156,15 @@ def test_a_bad_file_is_named_and_does_not_cost_the_others(
     assert "delete" not in str(problem.error)
 
 
+def test_a_recording_of_another_suites_task_is_sent_to_that_suite(root: Path) -> None:
+    """A task of that name exists only there."""
+    milk = "pick_up_the_milk_and_place_it_in_the_basket"
+    with h5py.File(file_in(root), "r+") as file:
+        file["data"].attrs["bddl_file_name"] = f"{milk}.bddl"
+    (problem,) = HDF5Source(root).index([TASK]).problems
+    assert f"try: move the file to {root / 'libero_object' / milk}_demo.hdf5" in str(problem.error)
+
+
 def test_overwritten_bytes_never_raise_anything_else(root: Path) -> None:
     whole, rng = file_in(root).read_bytes(), np.random.default_rng(0)
     for _ in range(25):

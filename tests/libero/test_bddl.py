@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from conftest import MILK, STOVE
+from conftest import BOWL, MILK, STOVE
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
@@ -80,6 +80,38 @@ def test_what_defines_no_task_is_refused_by_name(text: str, fault: str, tmp_path
         bddl.read(file)
     assert str(file) in str(caught.value)
     assert "expected: a BDDL problem with" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("section", "content", "fault"),
+    [
+        (":goal", "(And)", "the goal is empty"),
+        (":goal", "(Near akita_black_bowl_1 plate_1)", "has the fact (near akita_black_bowl_1 plate_1)"),
+        (":goal", "(And (Open akita_black_bowl_1 plate_1))", "has the fact (open akita_black_bowl_1 plate_1)"),
+        (
+            ":goal",
+            "(On akita_black_bowl_2 plate_1)",
+            ":goal names 'akita_black_bowl_2', which the file",
+        ),
+        (
+            ":init",
+            "(On plate_1 table_plate_region)",
+            ":init names 'table_plate_region', which the file",
+        ),
+        (":obj_of_interest", "akita_black_bowl plate_1", ":obj_of_interest names 'akita_black_bowl', which the file"),
+    ],
+)
+def test_names_and_predicates_that_mean_nothing_are_named(
+    section: str, content: str, fault: str, tmp_path: Path
+) -> None:
+    """LIBERO itself fails on them later, or ignores them."""
+    file, text = tmp_path / "task.bddl", BOWL.bddl_file.read_text()
+    start = text.index(f"({section}")
+    end = text.index("\n  )", start) + 4
+    file.write_text(f"{text[:start]}({section} {content}){text[end:]}")
+    with pytest.raises(PipelineError, match=re.escape(fault)) as caught:
+        bddl.read(file)
+    assert str(file) in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -27,12 +27,14 @@ class Hub:
     Attributes:
         files: path in the repository to content.
         breaks: paths whose transfer ends half way, however often it is tried.
+        flips: paths whose first byte arrives with another bit.
         sent: path, first byte and number of bytes of every transfer.
     """
 
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {"README.md": b"not asked for"}
         self.breaks: set[str] = set()
+        self.flips: set[str] = set()
         self.sent: list[tuple[str, int, int]] = []
         hub = self
 
@@ -64,6 +66,8 @@ class Hub:
                 span = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
                 first = int(span[1]) if span else 0
                 part = content[first:]
+                if name in hub.flips and not first:
+                    part = bytes([part[0] ^ 1]) + part[1:]
                 if body and name in hub.breaks:
                     part = part[: len(content) // 2 - first]
                 if body:
@@ -187,6 +191,16 @@ def test_goes_on_where_it_stopped(hub: Hub, tmp_path: Path, monkeypatch: pytest.
     # Since huggingface-hub 1 the file that it stopped in comes again.
     first = 25_000 if version("huggingface-hub") < "1" else 0
     assert [sent for sent in hub.sent if sent[0] == name] == [(name, first, 50_000 - first)]
+
+
+def test_a_file_that_arrives_damaged_is_named_and_comes_again(hub: Hub, tmp_path: Path) -> None:
+    hub.flips = {NAME}
+    with pytest.raises(PipelineError, match=rf"1 of 10 files .* arrived damaged, such as {NAME}"):
+        fetch(tmp_path, ["libero_goal"], hub.endpoint)
+    assert not (tmp_path / NAME).exists()
+    hub.flips.clear()
+    fetch(tmp_path, ["libero_goal"], hub.endpoint)
+    assert (tmp_path / NAME).read_bytes() == hub.files[NAME]
 
 
 def test_a_file_that_the_hub_lacks_is_named(hub: Hub, tmp_path: Path) -> None:

@@ -28,6 +28,20 @@ def test_tasks_are_selected_by_pattern_in_order() -> None:
     assert "libero_goal/" in str(caught.value)
 
 
+def test_a_faulty_file_of_another_suite_stops_no_selection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    stove = find_task("libero_goal", "turn_on_the_stove")
+    for suite, text in {"half": "(define", "whole": stove.bddl_file.read_text().replace("Turn on", "Light")}.items():
+        file = tmp_path / "tasks" / suite / "light_it.bddl"
+        file.parent.mkdir(parents=True)
+        file.write_text(text)
+    assert [str(task) for task in select_tasks(["whole/*"])] == ["whole/light_it"]
+    assert select_tasks(["libero_goal/turn_on_the_stove"]) == [stove]
+    for pattern in ("half/*", "*/light_it", "*light*"):
+        with pytest.raises(PipelineError, match=r"half/light_it\.bddl: the file is not a BDDL file"):
+            select_tasks([pattern])
+
+
 def test_unknown_task_names_the_closest() -> None:
     with pytest.raises(PipelineError, match="turn_on_the_stove"):
         find_task("libero_goal", "turn_on_stove")

@@ -69,4 +69,9 @@ def test_a_stated_licence_hides_no_restriction_of_a_source(data: Path) -> None:
     text = written(data, "rlds", publish=PublishConfig(licence="MIT", author="Jane Doe"))
     assert metadata_of(text)["license"] == "mit"
     assert "Some sources of the dataset have licences that are unknown, or that do not allow" in text
-    assert "**Demonstrations and tasks of my_suite**: by Jane Doe; their licence is unknown." in text
+    assert "**Demonstrations and tasks of my_suite**: by Jane Doe; the publisher states only the licence above." in text
+    unstated = written(data, "rlds")
+    assert (
+        "**Demonstrations and tasks of my_suite**: by the publisher of this dataset; their licence is unknown."
+        in unstated
+    )

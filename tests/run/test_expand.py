@@ -203,15 +203,24 @@ def test_what_is_rougher_than_the_human_is_dropped(
     assert (made.written, made.dropped) == (0, {"not_smooth": 2})
 
 
-@pytest.mark.parametrize("attrs", [{}, {hdf5.EXPANDED_FROM: "libero_goal/turn_on_the_stove/demo_0"}])
-def test_only_what_an_expansion_made_is_replaced(tmp_path: Path, attrs: dict[str, str]) -> None:
-    """Here by nothing, as if no candidate reached the goal."""
+FROM = {hdf5.EXPANDED_FROM: "libero_goal/turn_on_the_stove/demo_0"}
+
+
+@pytest.mark.parametrize("attrs", [{}, FROM, {**FROM, hdf5.EXPANDED_BY: "perturbed-libero 0.3.0"}])
+def test_only_what_an_expansion_made_is_replaced_and_only_if_that_is_allowed(
+    tmp_path: Path, attrs: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here by nothing, as if no candidate reached the goal. An exported episode names its source, but no expansion."""
     file = tmp_path / STOVE.suite / f"{STOVE.name}_demo.hdf5"
     demo = starter_demo(STOVE)
     states = np.tile(demo.init_state, (len(demo.actions), 1))
     hdf5.write(file, STOVE, [hdf5.Recording(demo.actions, states, states[:, :9], "<mujoco/>", {}, attrs)])
     before = file.read_bytes()
-    if attrs:
+    if hdf5.EXPANDED_BY in attrs:
+        with pytest.raises(PipelineError, match="1 demonstrations of an earlier expansion would be deleted"):
+            expand(tmp_path, TASKS, [], 1, loop)
+        assert file.read_bytes() == before
+        monkeypatch.setenv("REMAKE", "1")
         assert expand(tmp_path, TASKS, [], 1, loop).short == {f"{STOVE.suite}/{STOVE.name}": 1}
         assert not file.exists()
     else:

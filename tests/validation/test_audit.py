@@ -170,6 +170,26 @@ def test_an_episode_without_a_text_and_one_of_an_unknown_suite_are_counted(
     assert "pose" not in found.axes
 
 
+def test_what_is_labelled_as_of_another_suite_is_not_taken_for_a_test_task(
+    datasets: Path, test: TestSet, tmp_path: Path
+) -> None:
+    """Where its tasks are not defined, as at a reader of the dataset: its instructions are no rewrites of LIBERO's."""
+    edited = tmp_path / "edited"
+    shutil.copytree(datasets / "lerobot_v21", edited)
+    (provenance,) = edited.rglob("provenance.parquet")
+    listed = pq.read_table(provenance).to_pylist()
+    rewrite = {"axis": "language", "component": "paraphrase", "level": 1, "text": "lay it down"}
+    for row in listed:
+        row["suite"] = "my_kitchen"
+        if row["episode_id"] == WORDS:
+            row["perturbations"] = json.dumps([rewrite])
+    write_table(pa.Table.from_pylist(listed), provenance)
+    found = audit(edited, test)
+    assert found.without_task == len(IDS)
+    assert [*found.axes] == ["noise"]
+    assert found.unknown == {"language": 1}
+
+
 @pytest.mark.parametrize("arena", get_args(Arena))
 def test_the_agent_views_are_liberos(arena: Arena) -> None:
     class Recorder:

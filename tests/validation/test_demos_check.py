@@ -206,6 +206,35 @@ def test_damage_copies_and_strange_names_are_named(root: Path) -> None:
     assert f"{root / 'loose.hdf5'}: no run reads this file" in told
 
 
+@pytest.mark.parametrize(
+    ("goal", "fault"),
+    [
+        ("(And (On plate_1 main_table_plate_region))", "the goal holds before the first action"),
+        ("(On akita_black_bowl_1 main_table_far_region)", "cannot be replayed (scene_refused)"),
+    ],
+)
+def test_goals_that_no_recording_can_show(
+    root: Path, goal: str, fault: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The plate starts in its region, and the far region was not in the file when the recording was made."""
+    monkeypatch.chdir(root)
+    link_testset(root)
+    far = "(far_region (:target main_table) (:ranges ((0.2 0.2 0.22 0.22))))"
+    text = BOWL.bddl_file.read_text().replace("(And (On akita_black_bowl_1 plate_1))", goal)
+    definition, file = Path("tasks/my_suite/bowl_away.bddl"), Path("own/my_suite/bowl_away_demo.hdf5")
+    for path in (definition, file):
+        path.parent.mkdir(parents=True)
+    definition.write_text(text.replace("(:regions", f"(:regions {far}"))
+    shutil.copy(file_of(root, BOWL), file)
+    with h5py.File(file, "r+") as opened:
+        opened["data"].attrs["bddl_file_name"] = definition.name
+    (found,) = check(Path("own"), 1, loop).faults
+    assert fault in found
+    assert "bowl_away_demo.hdf5 data/demo_0" in found
+    if "scene_refused" in fault:
+        assert "the scene has no main_table_far_region" in capfd.readouterr().err
+
+
 def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The demonstrations of LIBERO's task, and its scene, under other names, with its goal and with another one."""
     monkeypatch.chdir(root)
