@@ -101,8 +101,6 @@ def _execute(
     try:
         environment.settle(settle_steps)
         states, alphas = [environment.state], [environment.site_alpha]
-        if environment.succeeded():
-            raise RefusedError("goal_at_start")
         for action in policy():
             environment.step(action)
             actions.append(action)

@@ -15,8 +15,9 @@ from pipeline.errors import PipelineError
 from pipeline.formats.hdf5.layout import VALIDATION_FOLDER
 from pipeline.libero.carried import IN_SCENE, task_named
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
-from pipeline.libero.starts import kept_actions
+from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.libero.tasks import STEP_LIMITS, exceeds_step_limit, find_task, suites
+from pipeline.physics.environment import shared
 from pipeline.planning.plan import twins
 from pipeline.run.outcome import MISSED
 from pipeline.run.replay_job import ReplayJob
@@ -137,6 +138,8 @@ class _FileJob:
         faults += [self._not_replayed(entry, reasons[entry]) for entry in chosen if _is_refused(reasons[entry])]
         if all_miss:
             faults += self._missing(missing, reasons)
+        elif "kept" in reasons.values():
+            faults += filter(None, map(self._reached_at_start, chosen))
         missed = [] if all_miss else [entry.demo_id for entry in missing]
         notes = [*index.notes, *_instruction_notes(self.task), *self._length_notes(index.entries)]
         return index.entries, CheckedDemos(replayed=len(chosen), faults=faults, missed=missed, notes=notes)
@@ -155,16 +158,24 @@ class _FileJob:
             return {entry: job().reason for entry, job in zip(entries, jobs, strict=True)}
 
     def _not_replayed(self, entry: DemoEntry, reason: str) -> str:
-        if reason == "goal_at_start":
-            what = "the goal holds before the first action, so every replay would count as a success"
-            expected = "a goal that the demonstration's actions reach"
-            return str(PipelineError(what, where=self._place(entry), expected=expected))
         expected = "a demonstration recorded with this LIBERO version, or with its model_file"
         return str(
             PipelineError(
                 f"the demonstration cannot be replayed ({reason})", where=self._place(entry), expected=expected
             )
         )
+
+    def _reached_at_start(self, entry: DemoEntry) -> str | None:
+        """Return an error if the goal holds before the first action, which makes every replay a success."""
+        environment, demo = shared(self.task), HDF5Source(self.root).load(entry.demo_id)
+        assert demo.model_xml is not None, "HDF5 files have it"
+        environment.restore(recorded_start(demo, demo.model_xml, settles=self.replay.settle_steps > 0))
+        environment.settle(self.replay.settle_steps)
+        if not environment.succeeded():
+            return None
+        what = "the goal holds before the first action, so every replay counts as a success"
+        expected = "a goal that the demonstration's actions reach"
+        return str(PipelineError(what, where=self._place(entry), expected=expected))
 
     def _missing(self, entries: Sequence[DemoEntry], reasons: Mapping[DemoEntry, str]) -> Iterator[str]:
         """Report each demonstration of a file whose replays all miss, with dropped no-ops and settings that help."""
