@@ -32,7 +32,7 @@ Step = Literal["physics", "pixels", "encoding", "evaluation", "checks", "picture
 
 RECIPES: dict[Step, int] = {
     "physics": 8,
-    "pixels": 6,
+    "pixels": 7,
     "encoding": 4,
     "evaluation": 3,
     "checks": 14,

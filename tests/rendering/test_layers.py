@@ -102,6 +102,35 @@ def test_the_same_pixels_whatever_moves(pair: Pair) -> None:
         assert pair.same(*CAMERAS)
 
 
+def test_at_equal_depth_the_same_geom_shows() -> None:
+    """The tops of all boxes, and of the site, lie in one plane. The green box moves over the others.
+
+    MuJoCo shows the geom that it draws last: the green one over the red one, the blue one over the green one, and the
+    site over the red one.
+    """
+    box = 'type="box" size="0.3 0.2 0.1"'
+    opened = Renderer(
+        f"""
+        <mujoco>
+          <worldbody>
+            <light pos="0.5 0 3" dir="0 0 -1" castshadow="false"/>
+            <geom {box} pos="-0.4 0 0" group="1" rgba="0.9 0.1 0.1 1"/>
+            <body mocap="true"><geom {box} group="1" rgba="0.1 0.9 0.1 1"/></body>
+            <geom {box} pos="0.4 0 0" group="1" rgba="0.1 0.1 0.9 1"/>
+            <site type="box" size="0.1 0.1 0.05" pos="-0.6 0 0.05" rgba="0.9 0.9 0.1 1"/>
+            <camera name="above" pos="0 0 3"/>
+          </worldbody>
+        </mujoco>"""
+    )
+    with both_ways(opened) as (ours, plain):
+        pair = Pair(opened, ours, plain, [])
+        for step in range(12):
+            opened.data.mocap_pos[0, 1] = 0.02 * step
+            assert pair.same("above"), f"step {step}"
+        colours = {tuple(np.sign(colour.astype(int) - 100)) for colour in opened.frame("above").reshape(-1, 3)}
+        assert len(colours) >= 4, "all four show"
+
+
 def test_what_stands_still_is_drawn_once(pair: Pair) -> None:
     for step in range(30):
         pair.opened.data.mocap_pos[0, 2] = 0.01 * step

@@ -181,7 +181,9 @@ class SoftwareDrawing(PlainDrawing):
         places = np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1).astype(np.float32)
         if camera not in self._still:
             self._still[camera] = Still(self._model)
-        still = self._still[camera].geoms(view, places, opaque) & opaque
+        # MuJoCo renders a geom of the mirror image in the camera's pass too, unless it is a mesh.
+        mirrored = shot.picture.images & (self._model.geom_type != mujoco.mjtGeom.mjGEOM_MESH)
+        still = self._still[camera].geoms(view, places, opaque) & opaque & ~mirrored
         underlay = None
         if still.any():
             if camera not in self._underlays:
@@ -191,6 +193,9 @@ class SoftwareDrawing(PlainDrawing):
                 self._draw_geoms(shot, still, last=False)
                 underlay.keep(content)
         self._draw_geoms(shot, opaque & ~still, underlay)
+        if underlay is not None and underlay.ties():
+            # At equal depth, the geom that MuJoCo renders last shows. An underlay does not know this order.
+            self._draw_geoms(shot, opaque)
 
     def _draw_geoms(
         self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True

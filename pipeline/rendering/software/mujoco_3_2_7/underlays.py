@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import mujoco
+import numpy as np
 
 from pipeline.rendering.opengl import calls, failure
 
@@ -40,8 +41,8 @@ class Underlay:
 
     Attributes:
         number: number of the display list that writes the underlay into the off-screen buffer. It writes only samples
-            at which no nearer geom was rendered; at equal depth the underlay wins. MuJoCo calls the list after all
-            opaque geoms (``Meshes``).
+            at which no nearer geom was rendered; at equal depth the underlay wins (``ties``). MuJoCo calls the list
+            after all opaque geoms (``Meshes``).
         content: identifier of the kept picture; empty at first.
     """
 
@@ -56,6 +57,7 @@ class Underlay:
             opengl.glFramebufferTexture2D(opengl.GL_FRAMEBUFFER, place, opengl.GL_TEXTURE_2D_MULTISAMPLE, texture, 0)
         opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
         self._program = self._shaders()
+        self._ties: int = np.atleast_1d(opengl.glGenQueries(1)).tolist()[0]
         self.number = calls().glGenLists(1)
         with recorded(self.number):
             self._draw()
@@ -80,6 +82,10 @@ class Underlay:
         opengl.glPopAttrib()
         self.content = content
 
+    def ties(self) -> int:
+        """Return the number of samples at which the last picture over the underlay had another geom of equal depth."""
+        return int(calls().glGetQueryObjectuiv(self._ties, calls().GL_QUERY_RESULT))
+
     def _draw(self) -> None:
         """Write the kept colour and depth into the current buffer."""
         opengl = calls()
@@ -87,16 +93,23 @@ class Underlay:
         for setting in ("ALPHA_TEST", "BLEND", "CULL_FACE", "POLYGON_OFFSET_FILL", "STENCIL_TEST"):
             opengl.glDisable(getattr(opengl, f"GL_{setting}"))
         opengl.glEnable(opengl.GL_DEPTH_TEST)
-        # MuJoCo's depth grows towards the camera.
-        opengl.glDepthFunc(opengl.GL_GEQUAL)
-        opengl.glDepthMask(True)
-        opengl.glColorMask(True, True, True, True)
         opengl.glPolygonMode(opengl.GL_FRONT_AND_BACK, opengl.GL_FILL)
         opengl.glViewport(0, 0, self._width, self._height)
         for unit, texture in enumerate(self._textures):
             opengl.glActiveTexture(opengl.GL_TEXTURE0 + unit)
             opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, texture)
         opengl.glUseProgram(self._program)
+        # First count the samples of equal depth, and write nothing.
+        opengl.glColorMask(False, False, False, False)
+        opengl.glDepthMask(False)
+        opengl.glDepthFunc(opengl.GL_EQUAL)
+        opengl.glBeginQuery(opengl.GL_SAMPLES_PASSED, self._ties)
+        opengl.glRectf(-1, -1, 1, 1)
+        opengl.glEndQuery(opengl.GL_SAMPLES_PASSED)
+        # MuJoCo's depth grows towards the camera.
+        opengl.glDepthFunc(opengl.GL_GEQUAL)
+        opengl.glDepthMask(True)
+        opengl.glColorMask(True, True, True, True)
         opengl.glRectf(-1, -1, 1, 1)
         opengl.glUseProgram(0)
         opengl.glPopAttrib()
