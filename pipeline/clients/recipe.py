@@ -91,8 +91,9 @@ def build(
         oft_validates = bool(validating) and validating == {*suites.values()}
     if lerobot is not None:
         dataset["lerobot"] = sourced(lerobot.name, "the run's configuration, export.lerobot.name")
-    own_suites = sorted(counts.keys() - {*SUITES})
-    tested = [f"--suite {suite}" for suite in sorted(counts)] + ["--own-step-limit N"] if own_suites else []
+    tested: list[str] = []
+    if counts.keys() - {*SUITES}:  # Without options, evaluate tests LIBERO's four suites.
+        tested = [*(f"--suite {suite}" for suite in sorted(counts)), "--own-step-limit N"]
     sections = _training_and_clients(export, oft_validates, rewrite_probability, content, tested)
     return {"name": (rlds or export).name, "dataset": dataset, **sections}
 

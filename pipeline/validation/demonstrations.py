@@ -138,8 +138,8 @@ class _FileJob:
         faults += [self._not_replayed(entry, reasons[entry]) for entry in chosen if _is_refused(reasons[entry])]
         if all_miss:
             faults += self._missing(missing, reasons)
-        elif "kept" in reasons.values():
-            faults += filter(None, map(self._reached_at_start, chosen))
+        reached = [entry for entry, reason in reasons.items() if reason == "kept"]
+        faults += filter(None, map(self._reached_at_start, reached))
         missed = [] if all_miss else [entry.demo_id for entry in missing]
         notes = [*index.notes, *_instruction_notes(self.task), *self._length_notes(index.entries)]
         return index.entries, CheckedDemos(replayed=len(chosen), faults=faults, missed=missed, notes=notes)

@@ -98,6 +98,19 @@ def test_a_scene_of_another_task_cannot_be_replayed(root: Path, whole: dict[Task
     )
 
 
+def test_a_demonstration_that_cannot_be_replayed_stops_no_check_of_a_good_one(root: Path) -> None:
+    with h5py.File(file_of(root, STOVE), "r+") as file:
+        states = file["data/demo_1/states"][:, :-2]
+        del file["data/demo_1/states"], file["data/demo_1"].attrs["init_state"]
+        file["data/demo_1/states"] = states
+    report = checked(root, replays=2)
+    (fault,) = report.faults
+    assert fault.startswith(
+        f"{file_of(root, STOVE)} data/demo_1: the demonstration cannot be replayed (state_mismatch)"
+    )
+    assert report.replayed == 4
+
+
 @pytest.fixture(scope="module")
 def waiting(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file whose demonstration rests for 15 steps while the gripper closes, as people do, and then lifts at once."""
