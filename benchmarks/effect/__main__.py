@@ -5,9 +5,10 @@
     nice -n 10 python benchmarks/effect evaluate ours 0    # 3. its results, in benchmarks/effect/results
     python benchmarks/effect table                         # 4. table and plot of docs/effect.md, of all results
 
-Each step first runs the missing steps before it. Experiments with held-out perturbations generate the data of all arms
-before an evaluation. After a stop, the same command resumes. Policies can be trained on different machines: the results
-of a policy are one file, to be committed, which also states the CPU time of each part.
+Each step first runs the missing steps before it. Experiments with held-out perturbations need the plan of all arms for
+an evaluation. The first evaluation generates the data of all arms for it, and stores it in the folder of the results.
+After a stop, the same command resumes. Policies can be trained on different machines: the results of a policy are one
+file, which also states the CPU time of each part. Commit it, and the plan of all arms.
 """
 
 import argparse
@@ -111,7 +112,7 @@ class Work:
         from results import PolicyResults
         from server_process import running
 
-        held_out = self._held_out() if self.experiment.evaluation.held_out else None
+        held_out = self._held_out(kept) if self.experiment.evaluation.held_out else None
         self.train(arm, seed)
         policy = self.policy(arm, seed)
         weights = checksum(policy / "model.safetensors")
@@ -151,20 +152,26 @@ class Work:
         nothing = [{"task": row.base, "state": row.number, "success": row.success} for row in seen]
         return PolicyResults(arm, seed, settings, made, rows, reading, nothing).write(kept)
 
-    def _held_out(self) -> HeldOut:
-        """Select the held-out perturbations, after the data of all arms are generated."""
+    def _held_out(self, kept: Path) -> HeldOut:
+        """Select the held-out perturbations.
+
+        Args:
+            kept: folder with the plan of all arms; without it, the data of all arms are generated first.
+        """
         import evaluation
 
-        rows: list[plan.Row] = []
-        for arm in self.experiment.every_arm:
-            self.make_data(arm)
-            rows += episodes.perturbed_rows(self.dataset(arm))
         names = [self.experiment.dataset_name(arm) for arm in self.experiment.every_arm]
         config = self.out / f"all_arms_{digest(names)[:8]}.yaml"
         sections = self.experiment.run.model_dump(mode="json", include={"demos", "plan"}, exclude_defaults=True)
         write(config, yaml.safe_dump({"name": config.stem, "folder": str(self.out), **sections}))
-        plan_file = owned(config).plan_file
-        plan.write(rows, plan_file)
+        plan_file, kept_plan = owned(config).plan_file, kept / f"{config.stem}.parquet"
+        if not kept_plan.exists():
+            rows: list[plan.Row] = []
+            for arm in self.experiment.every_arm:
+                self.make_data(arm)
+                rows += episodes.perturbed_rows(self.dataset(arm))
+            plan.write(rows, kept_plan)
+        write(plan_file, kept_plan.read_bytes())
         tests = evaluation.held_out_tests(self.experiment, own_draws.planned(plan_file))
         return HeldOut(tests, config, own_draws.sha256_of(plan_file))
 

@@ -23,11 +23,13 @@ from pipeline.images.jpeg import decode, resized
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import leakage, plan, selection
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
 from pipeline.run.outcome import rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, frames_by_trajectory
+from pipeline.stores.store import SUFFIX
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 
@@ -61,7 +63,7 @@ class Dataset:
 def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: Vectors, file: Path) -> None:
     """Plan, replay and render only an arm's episodes, and write them.
 
-    A stopped command resumes: replays and frames are kept next to the file.
+    A stopped command resumes: its replays and frames are kept next to the file, and used by other arms.
 
     Raises:
         PipelineError: before any replay, if there are too few demonstrations, a perturbation is too near to a test
@@ -73,8 +75,9 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
     leakage.refuse_overlap(leakage.check(rows, benchmark.load()))
     folder, run = file.with_suffix(""), experiment.run
     folder.mkdir(parents=True, exist_ok=True)
-    plan.write(rows, folder / "plan.parquet")
-    frames, trajectories = FrameStore(folder / "frames", run.render), TrajectoryStore(folder / "trajectories")
+    plan.write(rows, folder / PLAN)
+    _link_files_of_other_arms(folder)
+    frames, trajectories = FrameStore(folder / FRAMES, run.render), TrajectoryStore(folder / TRAJECTORIES)
     with runner(run.compute, folder, renders=True) as workers:
         rejected: dict[str, str] | None = None
         while (rejected_now := rejections(rows, frames_by_trajectory(frames.rows()))) != rejected:
@@ -93,6 +96,19 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
                 )
             render_plan(chosen, run, trajectories, frames, workers)
         _write(kept, EpisodeLoader(folder, run.render), experiment.frame_px, workers, file)
+
+
+def _link_files_of_other_arms(folder: Path) -> None:
+    """Link the replays and frames of the other arms, as the arms have many clean episodes in common.
+
+    A file is named after its content, so a file of the same name is the same.
+    """
+    for name in (TRAJECTORIES, FRAMES):
+        for file in folder.parent.glob(f"*/{name}/**/*{SUFFIX}"):
+            here = folder / name / file.relative_to(next(above for above in file.parents if above.name == name))
+            if not here.exists():
+                here.parent.mkdir(parents=True, exist_ok=True)
+                here.hardlink_to(file)
 
 
 def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tuple[list[plan.Row], list[plan.Row]]:
@@ -147,7 +163,7 @@ def perturbed_rows(file: Path) -> list[plan.Row]:
     """Return the rows of the plan of a dataset's perturbed episodes, without unused candidates."""
     with np.load(file) as arrays:
         kept = {row["episode_id"] for row in json.loads(str(arrays["episodes"]))}
-    rows = plan.read(file.with_suffix("") / "plan.parquet")
+    rows = plan.read(file.with_suffix("") / PLAN)
     return [row for row in rows if row.role == "perturbed" and row.episode_id in kept]
 
 

@@ -1,6 +1,7 @@
 """The experiment on the effect of the data: its settings, the episodes of an arm, training and results."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -489,3 +490,16 @@ def test_from_demonstrations_to_the_results(
     ]
     assert found.black == [{"task": STOVE.name, "state": 0, "success": False}]
     assert found.made["episodes_by_axis"] == {"clean": 1, "noise": 1}
+    (clean,), (more,) = (list(Path("data/effect/datasets").glob(f"{arm}_*/")) for arm in ("clean", "more"))
+    files = {file.relative_to(clean) for file in clean.glob("*/**/*.npz")}
+    assert {file.parts[0] for file in files} == {"trajectories", "frames"}
+    assert all((clean / file).samefile(more / file) for file in files), "rendered once for both arms"
+
+    # Another machine has the plan of all arms, and only one arm's data.
+    shutil.rmtree(clean)
+    clean.with_suffix(".npz").unlink()
+    monkeypatch.setattr(sys, "argv", words)
+    command.main()
+    assert not list(Path("data/effect/datasets").glob("clean_*"))
+    (again,) = results.read(kept)
+    assert again.rows == found.rows
