@@ -327,40 +327,60 @@ class Config(Frozen):
         return named
 
     @model_validator(mode="after")
-    def _sections_agree(self) -> Config:
-        chosen, axes = select_tasks(self.demos.tasks), self.plan.axes
+    def _weights_are_of_chosen_tasks(self) -> Config:
+        chosen = [str(task) for task in select_tasks(self.demos.tasks)]
         for name in self.plan.task_weights:
-            if name not in map(str, chosen):
+            if name not in chosen:
                 raise ValueError(f"plan.task_weights: demos.tasks does not select {name!r}; expected <suite>/<task>")
-        if axes.disturbance and self.replay.noops != "drop":
+        return self
+
+    @model_validator(mode="after")
+    def _replay_corrects_pushes(self) -> Config:
+        if not self.plan.axes.disturbance:
+            return self
+        if self.replay.noops != "drop":
             raise ValueError("the axis disturbance requires replay.noops: drop, as pushes count steps without no-ops")
-        if axes.disturbance and self.replay.mode == "open_loop":
+        if self.replay.mode == "open_loop":
             raise ValueError(
                 "the axis disturbance requires replay.mode: auto or tracked, as recorded actions do not correct pushes"
             )
-        if axes.language:
-            # The shipped bank has no rewrites of LIBERO-90.
-            banks = [load_bank()]
-            if axes.language.bank:
-                banks.append(load_further_bank(axes.language.bank))
-            without = []
-            for task in chosen:
-                if not any(bank.get(task.suite, {}).get(task.name) for bank in banks):
-                    without.append(str(task))
-            if without:
-                raise ValueError(
-                    f"plan.axes.language: {len(without)} tasks have no rewrites, such as {without[0]}; leave language "
-                    "out, exclude the tasks from demos.tasks, or name a bank that the command rewrite has written"
-                )
+        return self
+
+    @model_validator(mode="after")
+    def _tasks_have_rewrites(self) -> Config:
+        language = self.plan.axes.language
+        if not language:
+            return self
+        # The shipped bank has no rewrites of LIBERO-90.
+        banks = [load_bank()]
+        if language.bank:
+            banks.append(load_further_bank(language.bank))
+        without: list[str] = []
+        for task in select_tasks(self.demos.tasks):
+            if not any(bank.get(task.suite, {}).get(task.name) for bank in banks):
+                without.append(str(task))
+        if without:
+            raise ValueError(
+                f"plan.axes.language: {len(without)} tasks have no rewrites, such as {without[0]}; leave language "
+                "out, exclude the tasks from demos.tasks, or name a bank that the command rewrite has written"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _formats_hold_the_content(self) -> Config:
         for options in self.export.formats.values():
             options.refuse_content(self.render.content)
+        return self
+
+    @model_validator(mode="after")
+    def _export_selects_from_the_run(self) -> Config:
         components = {CLEAN}
-        for axis in axes.configured():
+        for axis in self.plan.axes.configured():
             components.update(components_of(axis))
         values_of_run = {
             "axis": {CLEAN, *self.plan.episodes},
             "component": components,
-            "suite": {task.suite for task in chosen},
+            "suite": {task.suite for task in select_tasks(self.demos.tasks)},
         }
         for field, values in values_of_run.items():
             for value in getattr(self.export.where, field, None) or ():
