@@ -18,7 +18,7 @@ def licence_of(source: str) -> set[str]:
 
 
 def test_every_source_of_textures_and_objects_has_its_row() -> None:
-    for source, licence in {**texture_sources._LICENCES, **sweethome3d.LICENCES}.items():
+    for source, licence in {**texture_sources.LICENCES, **sweethome3d.LICENCES}.items():
         assert licence in licence_of(source), source
 
 

@@ -66,6 +66,7 @@ class Covering(Frozen):
         texture: name in the sources of :mod:`pipeline.catalogue.textures`.
         licence: licence that the texture's source states.
         sha256: hash of the texture.
+        author: author of a user's texture, if the configuration names one.
         quarter_turns: number of counter-clockwise turns by 90 degrees.
     """
 
@@ -73,6 +74,7 @@ class Covering(Frozen):
     texture: str
     licence: str
     sha256: str
+    author: str = Field(default="", exclude_if=lambda author: not author)
     quarter_turns: Annotated[int, Field(ge=0, le=3)] = 0
 
 
@@ -135,7 +137,7 @@ class BackgroundPerturbation(RenderPerturbation):
 
     def credits(self) -> frozenset[Credit]:
         """List the textures with their licences."""
-        return frozenset(Credit(c.texture, "texture", c.licence, "") for c in self.coverings)
+        return frozenset(Credit(c.texture, "texture", c.licence, c.author) for c in self.coverings)
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Measure the changed share of each view."""
@@ -220,6 +222,7 @@ class BackgroundAxis(Axis):
             texture=texture.name,
             licence=texture.licence,
             sha256=texture.sha256,
+            author=texture.author,
             quarter_turns=int(rng.integers(4)),
         )
 

@@ -51,6 +51,51 @@ class _Part(NamedTuple):
     image: Image.Image | None
 
 
+def material_files(obj: Path) -> list[Path]:
+    """List the files of an OBJ's materials: its material library and the images that the library names.
+
+    trimesh converts a model without the materials and images that it cannot read. Therefore they are checked here.
+
+    Raises:
+        PipelineError: when the OBJ or the library cannot be read, or an image is missing or damaged.
+    """
+    libraries = [obj.parent / name for name in _values(obj, "mtllib")[:1]]  # trimesh reads the first one
+    images: list[Path] = []
+    for library in libraries:
+        images += [obj.parent / name for name in _values(library, "map_kd")]
+    for image in images:
+        try:
+            with Image.open(image) as opened:
+                opened.load()
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            raise _unreadable(image, error) from error
+    return libraries + images
+
+
+def _values(file: Path, key: str) -> list[str]:
+    """Return the rest of each line of a text file that begins with a key."""
+    try:
+        lines = file.read_text(errors="replace").splitlines()
+    except OSError as error:
+        raise _unreadable(file, error) from error
+    values: list[str] = []
+    for line in lines:
+        first, _, value = line.strip().partition(" ")
+        if first.lower() == key:
+            values.append(value.strip())
+    return values
+
+
+def _unreadable(file: Path, error: Exception) -> PipelineError:
+    """Return the error about a file that an OBJ or its library names."""
+    return PipelineError(
+        f"the model's file cannot be read ({error})",
+        where=file,
+        expected="the name of a readable file after mtllib or map_Kd, without options",
+        remedy="put the file there, replace a damaged file, or delete the line that names it",
+    )
+
+
 def convert(obj: Path, out: Path, size_m: tuple[float, float, float] | None = None, turn: Floats | None = None) -> None:
     """Write ``model.xml``, meshes and textures of an OBJ (y up) into the folder ``out``.
 

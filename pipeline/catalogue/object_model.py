@@ -155,6 +155,15 @@ class ObjectModel:
                 expected="paths relative to the model, pos and quat for places, every attribute on its element",
                 remedy="compile the model, save it with mujoco.mj_saveLastXML, then resolve frames and defaults",
             )
+        for element in bodies_and_geoms:
+            for name, count in (("pos", 3), ("quat", 4)):
+                text = element.get(name)
+                if text is not None and not _is_place(text, count):
+                    raise PipelineError(
+                        f'the model has <{element.tag} {name}="{text}">',
+                        where=self.mjcf,
+                        expected=f"{count} finite numbers" + (", not all zero" if name == "quat" else ""),
+                    )
         unread = sorted(_unread(root))
         if unread:
             raise PipelineError(
@@ -231,6 +240,15 @@ def _placed(bodies: Iterable[ET.Element], pos: Floats, quat: Floats) -> Iterator
                 yield child, at, turn
             else:
                 yield from _placed([child], at, turn)
+
+
+def _is_place(text: str, count: int) -> bool:
+    """Return whether a text has ``count`` finite numbers, not all of them zero if they are a quaternion's four."""
+    try:
+        numbers = np.array(text.split(), float)
+    except ValueError:
+        return False
+    return len(numbers) == count and bool(np.isfinite(numbers).all()) and (count != 4 or bool(numbers.any()))
 
 
 def _numbers(values: Floats) -> str:

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 
 from pipeline.catalogue import sweethome3d
-from pipeline.catalogue.meshes import RECIPE, convert
+from pipeline.catalogue.meshes import RECIPE, convert, material_files
 from pipeline.catalogue.object_model import ObjectModel, asset_name
 from pipeline.catalogue.sources import Folder
 from pipeline.errors import PipelineError
@@ -134,8 +134,14 @@ def _sweethome3d() -> Iterator[ObjectModel]:
 
 def _own(source: Folder) -> Iterator[ObjectModel]:
     """Yield the objects of a user's folder; new or changed models are converted first."""
-    models = [path for path in source.folder.glob("*/*") if path.suffix.lower() in (".obj", ".xml")]
-    paths = sorted(path for path in models if not path.name.startswith("."))
+    visible = sorted(path for path in source.folder.glob("*/*") if not path.name.startswith("."))
+    files_of = {path: _files_of(path) for path in visible if path.suffix.lower() == ".xml"}
+    # The meshes of an MJCF model are no models of their own.
+    meshes = {file.resolve() for files in files_of.values() for file in files}
+    for path in visible:
+        if path.suffix.lower() == ".obj" and path.resolve() not in meshes:
+            files_of[path] = _files_of(path)
+    paths = sorted(files_of)
     if not paths:
         raise PipelineError(
             "the folder has no models",
@@ -152,39 +158,59 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
                 expected="the noun of an instruction for the objects, in lower case, such as bottle_of_milk",
                 remedy="rename the folder",
             )
-        made_from = digest("object", RECIPE, path.name, _hashed_files(path.parent))
+        hashed = [(file.relative_to(path.parent).as_posix(), checksum(file)) for file in (path, *files_of[path])]
+        made_from = digest("object", RECIPE, path.name, hashed)
         # The name holds a hash of the model's origin, so that an earlier plan still finds its own objects.
         name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
         about = {"made_from": made_from, "category": category, "licence": source.licence}
-        about["attribution"] = f"{category}/{path.name}"
+        about["attribution"] = f"{category}/{path.name}" + (f" by {source.author}" if source.author else "")
         if _about(name) != about:
             with _locked(), _made(name, about) as folder:
                 if path.suffix.lower() == ".obj":
                     convert(path, folder)
-                    _check_size(folder / "model.xml", path)
+                    _check(folder / "model.xml", path)
                 else:
-                    _check_size(path, path)
+                    _check(path, path)
                     _copy(path, folder)
         yield converted(name)
 
 
-def _hashed_files(folder: Path) -> list[tuple[str, str]]:
-    """List the files of a folder and its subfolders with their hashes, in order of their paths.
+def _files_of(path: Path) -> list[Path]:
+    """List the files that a user's model names, in order of their paths.
 
-    A model's materials and textures are stored in the same folder as the model. Hidden files and folders are left out.
+    Raises:
+        PipelineError: when the model cannot be read, or a file is missing, damaged, or outside of the model's folder.
     """
-    files = []
-    for file in sorted(folder.rglob("*")):
-        below = file.relative_to(folder)
-        hidden = any(part.startswith(".") for part in below.parts)
-        if file.is_file() and not hidden:
-            files.append((below.as_posix(), checksum(file)))
-    return files
+    if path.suffix.lower() == ".obj":
+        files = material_files(path)
+    else:
+        try:
+            files = [path.parent / asset.attrib["file"] for asset in ET.parse(path).iterfind("asset/*[@file]")]
+        except (OSError, ET.ParseError) as error:
+            raise PipelineError(f"the model is not readable ({error})", where=path) from error
+    for file in files:
+        if not file.resolve().is_relative_to(path.parent.resolve()):
+            raise PipelineError(
+                f"the file {file} is outside of the model's folder",
+                where=path,
+                expected="files in the model's folder, or below it",
+                remedy="copy the file into the model's folder, and name it by its path from this folder",
+            )
+        if not file.is_file():
+            raise PipelineError(
+                f"the model names the file {file}, which is missing",
+                where=path,
+                remedy="put the file there, or correct its name in the model",
+            )
+    return sorted(set(files))
 
 
-def _check_size(mjcf: Path, path: Path) -> None:
-    """Reject a user's model that is larger than ``LARGEST_M``; an error names it by ``path``."""
-    low, high, _ = ObjectModel("", "", "", "", mjcf).shape
+def _check(mjcf: Path, path: Path) -> None:
+    """Reject a user's model, by its ``path``, if it is larger than ``LARGEST_M`` or MuJoCo cannot use it."""
+    import mujoco
+
+    model = ObjectModel("", "", "", "", mjcf)
+    low, high, _ = model.shape
     longest = max(up - down for up, down in zip(high, low, strict=True))
     if longest > LARGEST_M:
         raise PipelineError(
@@ -193,28 +219,21 @@ def _check_size(mjcf: Path, path: Path) -> None:
             expected=f"at most {LARGEST_M} m in any direction",
             remedy="scale the model to metres, or move it out of the folder",
         )
+    assets, body = model.mjcf_of("object")
+    try:
+        mujoco.MjModel.from_xml_string(f"<mujoco><asset>{assets}</asset><worldbody>{body}</worldbody></mujoco>")
+    except ValueError as error:
+        raise PipelineError(f"MuJoCo cannot use the model ({error})", where=path) from error
 
 
 def _copy(mjcf: Path, out: Path) -> None:
     """Copy a model and the files that it names into one folder."""
-    try:
-        tree = ET.parse(mjcf)
-        for number, asset in enumerate(tree.iterfind("asset/*[@file]")):
-            file = (mjcf.parent / asset.attrib["file"]).resolve()
-            if not file.is_relative_to(mjcf.parent.resolve()):
-                raise PipelineError(
-                    f"the file {asset.attrib['file']} is outside of the model's folder",
-                    where=mjcf,
-                    expected="files in the model's folder, or below it",
-                    remedy="copy the file into the model's folder, and name it by its path from this folder",
-                )
-            asset.set("name", asset_name(asset))
-            asset.set("file", f"{number}{file.suffix}")
-            shutil.copyfile(file, out / asset.attrib["file"])
-    except (OSError, ET.ParseError) as error:
-        raise PipelineError(
-            f"the model cannot be copied ({error})", where=mjcf, expected="MJCF with its files"
-        ) from error
+    tree = ET.parse(mjcf)
+    for number, asset in enumerate(tree.iterfind("asset/*[@file]")):
+        file = mjcf.parent / asset.attrib["file"]
+        asset.set("name", asset_name(asset))
+        asset.set("file", f"{number}{file.suffix}")
+        shutil.copyfile(file, out / asset.attrib["file"])
     tree.write(out / "model.xml")
 
 
@@ -232,10 +251,10 @@ def _made(name: str, about: dict[str, str]) -> Iterator[Path]:
 
 
 def _about(name: str) -> dict[str, str] | None:
-    """Read ``about.json`` of a converted model; return `None` if there is no such model."""
+    """Read ``about.json`` of a converted model; return `None` if there is no such model, or the file is damaged."""
     try:
         about: dict[str, str] = json.loads((FOLDER / name / "about.json").read_text())
-    except FileNotFoundError:
+    except (FileNotFoundError, ValueError):
         return None
     return about
 

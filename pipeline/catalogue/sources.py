@@ -1,5 +1,7 @@
 """A user's folder as a source of textures or of object models."""
 
+from pydantic import Field
+
 from pipeline.types import Frozen, Place
 
 
@@ -9,8 +11,12 @@ class Folder(Frozen):
     Attributes:
         folder: Path of the folder. Textures are the PNG and JPEG files in it and its subfolders. Objects are
             ``<category>/<name>.obj`` (y up, in metres) and ``<category>/<name>.xml`` (MJCF, z up).
-        licence: Licence of the textures or objects, recorded with every episode that shows one of them.
+        licence: Licence of the textures or objects, recorded with every episode that shows one of them. An SPDX
+            identifier, such as CC-BY-4.0, lets the dataset card derive its own licence.
+        author: Author of the textures or objects, whom the dataset card names; none by default.
     """
 
     folder: Place
-    licence: str
+    licence: str = Field(min_length=1)
+    # Excluded at its default, as a field that was added later.
+    author: str = Field(default="", exclude_if=lambda author: not author)

@@ -49,7 +49,7 @@ WHEELS = {
         content="gymnasium-robotics' textures (26 MB)",
     ),
 }
-_LICENCES = {
+LICENCES = {
     # The package states MIT for its code and leaves the images to their upstream authors.
     "libero": "MIT (LIBERO)",
     "robosuite": "MIT (robosuite)",
@@ -76,6 +76,7 @@ class Texture:
         licence: licence that the source states.
         sha256: hash of the image file. A procedural texture has the hash of its recipe (generator's version, family,
             index), so that rounding on another processor does not make it another texture.
+        author: author of a user's file, if the configuration names one.
         load: function that returns (H, W, 3) RGB; it raises a PipelineError when the file is missing or no image.
         own: the file of a user's image.
     """
@@ -86,6 +87,7 @@ class Texture:
     sha256: str
     load: Callable[[], Frame] = field(repr=False, compare=False)
     own: Path | None = field(default=None, repr=False, compare=False)
+    author: str = ""
 
     @property
     def family(self) -> str | None:
@@ -114,18 +116,18 @@ def offered(source: Source) -> Iterator[Texture]:
             for file in files:
                 texture = from_file("folder:", file, source.licence)
                 name = f"folder:{texture.sha256[:8]}/{file.relative_to(source.folder).as_posix()}"
-                yield replace(texture, name=name, own=file)
+                yield replace(texture, name=name, own=file, author=source.author)
         case "procedural":
             for family, index in product(procedural.FAMILIES, range(PROCEDURAL_PER_FAMILY)):
                 sha256 = seeding.digest("texture", procedural.RECIPE, family, index)
                 make = partial(procedural.texture, family, index)
-                yield Texture(f"procedural:{family}/{index:03d}", source, _LICENCES[source], sha256, make)
+                yield Texture(f"procedural:{family}/{index:03d}", source, LICENCES[source], sha256, make)
         case "libero":
             for file in libero_images():
-                yield from_file(f"libero:{file.name}", file, _LICENCES[source])
+                yield from_file(f"libero:{file.name}", file, LICENCES[source])
         case "robosuite":
             for file in _images(package_folder("robosuite") / "models" / "assets" / "textures"):
-                yield from_file(f"robosuite:{file.name}", file, _LICENCES[source])
+                yield from_file(f"robosuite:{file.name}", file, LICENCES[source])
         case "metaworld" | "gymnasium-robotics":
             without = f"leave {source} out of plan.axes.background.sources"
             path = fetch_wheel(WHEELS[source], FOLDER, without)
@@ -134,7 +136,7 @@ def offered(source: Source) -> Iterator[Texture]:
                 for member in members:
                     name = f"{source}:{member.partition('/assets/')[2].replace('textures/', '')}"
                     sha256 = hashlib.sha256(archive.read(member)).hexdigest()
-                    yield Texture(name, source, _LICENCES[source], sha256, partial(_member, path, member))
+                    yield Texture(name, source, LICENCES[source], sha256, partial(_member, path, member))
 
 
 def from_file(name: str, file: Path, licence: str) -> Texture:

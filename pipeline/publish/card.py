@@ -15,6 +15,7 @@ from huggingface_hub import DatasetCardData
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
+from pipeline.catalogue import texture_sources
 from pipeline.clients.files import RECIPE
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum, read_json, schema_file
@@ -39,8 +40,8 @@ CHECKSUMS = "SHA256SUMS"
 REPOSITORY = "OWNER/NAME"
 """Placeholder in a card for the repository, which is not known before the upload."""
 
-FREE = re.compile(r"(MIT|Apache-2\.0|CC0-1\.0|CC-BY-\d)")
-"""Beginnings of the licences under which a derived work may be CC BY 4.0."""
+FREE = re.compile(r"MIT|Apache-2\.0|BSD-[23]-Clause|CC0-1\.0|CC-BY-\d\.\d(-US)?", re.IGNORECASE)
+"""SPDX identifiers of the licences under which a derived work may be CC BY 4.0."""
 
 
 TEMPLATES = jinja2.Environment(
@@ -129,7 +130,8 @@ def render(
     own_suites = [suite for suite in kept_suites if suite not in SUITES]
     own_rewrites = _own_rewrites(kept)
     libero = own_suites != kept_suites
-    free = all(FREE.match(credit.licence) for credit in owed) and not (own_suites or own_rewrites)
+    licences = {credit.licence for credit in owed} - {*texture_sources.LICENCES.values()}
+    free = all(map(FREE.fullmatch, licences)) and not (own_suites or own_rewrites)
     axes = _axes(kept, shown)
     demos = {row["demo_id"] for row in kept}
     known = [Known(row["suite"], demo=row["demo_id"], origin=row["demo_origin_sha256"]) for row in kept]

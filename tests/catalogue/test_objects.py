@@ -48,9 +48,11 @@ usemtl floor
 f 1/1 2/2 3/3
 f 1/1 3/2 4/3
 """
+BARE = HOUSE.replace("mtllib house.mtl\n", "")
 MATERIALS = "newmtl roof\nKd 1 1 1\nmap_Kd roof.png\nnewmtl floor\nKd 0.2 0.4 0.6\n"
 
 TWISTED = '<mujoco><worldbody><body><geom type="box" size="1"/></body></worldbody></mujoco>'
+BADLY_PLACED = '<mujoco><worldbody><body><geom size=".02" %s/></body></worldbody></mujoco>'
 BEREFT = (
     '<mujoco><asset><mesh name="m" file="lost.obj"/></asset>'
     '<worldbody><body><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
@@ -207,6 +209,56 @@ def test_a_user_s_model_is_converted_once_and_again_when_its_texture_changes(
     assert find(before.name, before.sha256) == before
 
 
+def test_other_files_and_models_of_a_category_change_no_model(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine" / "toy_house"
+    write_house(mine, scale=0.01)
+    before = models(own(tmp_path / "mine"))
+    (mine / "LICENSE.txt").write_text("added later")
+    (mine / "hut.obj").write_text((mine / "house.obj").read_text())
+    models.cache_clear()
+    after = models(own(tmp_path / "mine"))
+    assert len(after) == 2
+    assert before.items() <= after.items()
+
+
+def test_the_meshes_of_an_mjcf_model_are_no_objects(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine" / "toy_house"
+    write_house(mine, scale=0.01)
+    (mine / "tall.xml").write_text(
+        '<mujoco><asset><mesh name="walls" file="house.obj"/></asset>'
+        '<worldbody><body><geom type="mesh" mesh="walls"/></body></worldbody></mujoco>'
+    )
+    # MuJoCo does not read the materials of a mesh.
+    (mine / "house.mtl").unlink()
+    (tall,) = models(own(tmp_path / "mine")).values()
+    assert tall.attribution == "toy_house/tall.xml"
+    low, high, _ = tall.shape
+    np.testing.assert_allclose(np.array(high) - np.array(low), [0.1, 0.2, 0.1], atol=1e-5)
+
+
+@pytest.mark.parametrize("damage", ["missing", "no image", "cut short"])
+@pytest.mark.parametrize("model", ["house.obj", "label.xml"])
+def test_a_model_without_its_picture_is_refused(folder: Path, tmp_path: Path, model: str, damage: str) -> None:
+    mine = tmp_path / "mine" / "toy_house"
+    write_house(mine, scale=0.01)
+    if model == "label.xml":
+        (mine / "house.obj").unlink()
+        (mine / model).write_text(
+            '<mujoco><asset><texture name="t" type="2d" file="roof.png"/><material name="m" texture="t"/></asset>'
+            '<worldbody><body><geom type="box" size=".02 .02 .02" material="m"/></body></worldbody></mujoco>'
+        )
+    picture = (mine / "roof.png").read_bytes()
+    # Each damage has its own file, as MuJoCo keeps what it has read from a file.
+    (mine / "roof.png").unlink()
+    if damage != "missing":
+        (mine / "roof.png").write_bytes(b"no image" if damage == "no image" else picture[: len(picture) // 2])
+    with pytest.raises(PipelineError, match=r"mine/toy_house/(?s:.*)roof\.png"):
+        models(own(tmp_path / "mine"))
+    assert list(folder.glob("own/*")) == []
+    (mine / "roof.png").write_bytes(picture)
+    assert len(models(own(tmp_path / "mine"))) == 1
+
+
 def test_hidden_files_change_no_model_and_capital_suffixes_are_models(folder: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine" / "cube"
     mine.mkdir(parents=True)
@@ -327,14 +379,18 @@ def test_models_that_would_change_their_meaning_are_refused(geom: str, tmp_path:
     ("file", "content", "message"),
     [
         (None, "", r"mine: the folder has no models(?s:.*)<category>/<name>\.obj"),
-        ("can_of_soda/x.obj", HOUSE.replace("5", "0.05").replace("20", "0.2"), "can_of_soda"),
-        ("Cube/x.obj", HOUSE, "'Cube' is not a category"),
+        ("can_of_soda/x.obj", BARE.replace("5", "0.05").replace("20", "0.2"), "can_of_soda"),
+        ("Cube/x.obj", BARE, "'Cube' is not a category"),
         ("dot/dot.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", r"dot\.obj"),
-        ("house/house.obj", HOUSE, r"house\.obj: the model measures 20 m(?s:.*)at most 0\.5 m"),
+        ("house/house.obj", HOUSE, r"house/house\.mtl: the model's file cannot be read"),
+        ("house/house.obj", BARE, r"house\.obj: the model measures 20 m(?s:.*)at most 0\.5 m"),
         ("cube/x.xml", "<mujoco", r"x\.xml"),
         ("cube/x.xml", "<mujoco><worldbody/></mujoco>", r"x\.xml: .*no collision geometry"),
         ("cube/x.xml", TWISTED, r"mine/cube/x\.xml: MuJoCo cannot use the model"),
-        ("cube/x.xml", BEREFT, r"mine/cube/x\.xml: MuJoCo cannot use the model(?s:.*)lost\.obj"),
+        ("cube/x.xml", BEREFT, r"mine/cube/x\.xml: the model names the file (?s:.*)lost\.obj, which is missing"),
+        ("cube/x.xml", BADLY_PLACED % 'pos="a b c"', r"mine/cube/x\.xml: the model has <geom pos=\"a b c\">"),
+        ("cube/x.xml", BADLY_PLACED % 'pos="0 0"', r"3 finite numbers"),
+        ("cube/x.xml", BADLY_PLACED % 'quat="0 0 0 0"', r"4 finite numbers, not all zero"),
     ],
 )
 def test_what_is_wrong_with_a_user_s_folder_is_named(
@@ -351,11 +407,11 @@ def test_what_is_wrong_with_a_user_s_folder_is_named(
 
 def test_a_configuration_can_name_a_folder(folder: Path, tmp_path: Path) -> None:
     write_house(tmp_path / "mine" / "toy_house", scale=0.01)
-    sources = ["libero", {"folder": str(tmp_path / "mine"), "licence": "CC0-1.0"}]
+    sources = ["libero", {"folder": str(tmp_path / "mine"), "licence": "CC0-1.0", "author": "Jane Doe"}]
     axis = LayoutAxis.model_validate({"levels": [1], "sources": sources})
     drawn = [axis.sample(rng("own", key), find_task("libero_goal", "turn_on_the_stove"), 0) for key in range(300)]
     (added,) = {one.objects[0] for one in drawn if one.objects[0].category == "toy_house"}
-    assert (added.licence, added.attribution) == ("CC0-1.0", "toy_house/house.obj")
+    assert (added.licence, added.attribution) == ("CC0-1.0", "toy_house/house.obj by Jane Doe")
 
 
 @pytest.fixture

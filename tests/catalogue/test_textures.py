@@ -16,7 +16,9 @@ from conftest import REPOSITORY, STOVE
 from libero.libero import get_libero_path
 from numpy.typing import NDArray
 
+from pipeline.axes import from_json, to_json
 from pipeline.axes.background import BackgroundAxis
+from pipeline.axes.base import Credit
 from pipeline.catalogue import procedural, texture_sources, textures
 from pipeline.catalogue.downloads import Wheel
 from pipeline.catalogue.sources import Folder
@@ -128,14 +130,17 @@ def test_a_folder_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     (folder / "wood").mkdir(parents=True)
     oak = folder / "wood" / "oak_COL.png"
     cv2.imwrite(str(oak), np.full((8, 8, 3), (10, 20, 200), np.uint8))
-    offered = catalogue((Folder(folder=folder, licence="CC-BY 4.0 Jane Doe"),))
+    offered = catalogue((Folder(folder=folder, licence="CC-BY-4.0", author="Jane Doe"),))
     (texture,) = offered.values()
-    assert texture.licence == "CC-BY 4.0 Jane Doe"
+    assert (texture.licence, texture.author) == ("CC-BY-4.0", "Jane Doe")
     assert texture.load()[0, 0].tolist() == [200, 20, 10]
     # A name that every machine may know, and that two images of one name do not share.
     assert texture.name == f"folder:{texture.sha256[:8]}/wood/oak_COL.png"
     # What was drawn is shown, whatever becomes of the folder.
-    BackgroundAxis(sources=(Folder(folder=folder, licence="CC-BY 4.0 Jane Doe"),)).sample(rng("oak"), STOVE, 0)
+    sources = (Folder(folder=folder, licence="CC-BY-4.0", author="Jane Doe"),)
+    drawn = BackgroundAxis(sources=sources).sample(rng("oak"), STOVE, 0)
+    assert drawn.credits() == {Credit(texture.name, "texture", "CC-BY-4.0", "Jane Doe")}
+    assert from_json(to_json([drawn])) == (drawn,)
     oak.unlink()
     assert pixels(texture.name, texture.sha256)[0, 0].tolist() == [200, 20, 10]
     with pytest.raises(PipelineError, match=r"oak_COL.png is missing(?s:.*)python stages/plan.py CONFIG"):

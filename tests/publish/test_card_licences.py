@@ -27,7 +27,12 @@ def test_everything_shown_is_attributed(data: Path) -> None:
 
 @pytest.mark.parametrize(
     ("licence", "free"),
-    [("CC-BY-3.0-US", True), ("CC0-1.0", True), ("CC-BY-NC-4.0", False), ("CC-BY-SA-4.0", False), ("mine", False)],
+    [
+        *(("CC-BY-3.0-US", True), ("CC0-1.0", True), ("cc-by-4.0", True), ("MIT (robosuite)", True)),
+        *(("CC-BY-NC-4.0", False), ("CC-BY-SA-4.0", False), ("mine", False), ("MIT-style, no redistribution", False)),
+        *(("CC-BY-4.0 NonCommercial", False), ("MIT (code only), images all rights reserved", False)),
+        ("Apache-2.0 WITH Commons-Clause", False),
+    ],
 )
 def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, free: bool) -> None:
     coverings = tuple(covering.model_copy(update={"licence": licence}) for covering in BACKGROUND.coverings)
