@@ -203,17 +203,18 @@ def _check_own_tasks(wanted: Sequence[EvaluationTask], settings: EpisodeSettings
                 remedy="leave --own-step-limit out",
             )
         return
-    task = find_task(own_tasks[0].suite, own_tasks[0].base)
     if settings.own_step_limit is None and settings.demos is not None:
-        longest = recordings.longest_steps(task, settings.demos)
+        named = [find_task(suite, name) for suite, name in sorted({(task.suite, task.base) for task in own_tasks})]
+        steps = {task: recordings.longest_steps(task, settings.demos) for task in named}
+        longest = max(named, key=lambda task: steps[task])
         raise PipelineError(
-            f"LIBERO has no step limit for your suite {task.suite}",
+            f"LIBERO has no step limit for your suite {longest.suite}",
             where="own_step_limit",
-            expected=f"more than the {longest} steps of the longest demonstration of {task.name}; LIBERO's limits are "
-            "3 to 14 % above its longest demonstrations",
+            expected=f"more than the {steps[longest]} steps of the longest demonstration, of {longest.name}; LIBERO's "
+            "limits are 3 to 14 % above its longest demonstrations",
             remedy="add --own-step-limit N",
         )
-    settings.step_limit(task.suite)
+    settings.step_limit(own_tasks[0].suite)
     for suite, name in {(one.suite, one.base) for one in own_tasks if one.source == "own"}:
         recordings.count_of(find_task(suite, name), settings.demos)
 

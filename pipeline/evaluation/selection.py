@@ -65,7 +65,7 @@ class Selection(Frozen, use_attribute_docstrings=True):
     levels: tuple[int, ...] = ()
     """only these levels"""
     tasks: tuple[str, ...] = ()
-    """shell-style patterns, one of which must match the name of the task or of its LIBERO task"""
+    """shell-style patterns, one of which must match the name of the task or of its LIBERO task, or suite/name"""
     episodes: int = Field(default=1, ge=1)
     """number of LIBERO's 50 initial states per task, of resets of an own task, or of demonstrations; for ``own``,
     number of perturbations per task, axis and level, whose initial states repeat from the 51st on"""
@@ -218,9 +218,15 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
     """Return whether a task matches the names and the other restrictions of a selection."""
-    named = not selection.tasks or any(fnmatch.filter((task.name, task.base), pattern) for pattern in selection.tasks)
+    named = not selection.tasks or any(fnmatch.filter(_names(task), pattern) for pattern in selection.tasks)
     asked = {column: getattr(selection, field) for field, column in COLUMNS.items()}
     return named and all(not values or getattr(task, column) in values for column, values in asked.items())
+
+
+def _names(task: EvaluationTask) -> set[str]:
+    """Return the names that a pattern may match: of the task and its LIBERO task, alone and after the suite."""
+    names = {task.name, task.base}
+    return names | {f"{task.suite}/{name}" for name in names}
 
 
 def _of_unknown_level(listed: Sequence[EvaluationTask], selection: Selection) -> Counter[str]:
@@ -241,11 +247,15 @@ def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> Non
     for field in ("axes", "components", "levels"):
         values = {getattr(task, COLUMNS[field]) for task in listed}
         _check_known(field, getattr(selection, field), values, selection)
+    if not selection.tasks:
+        return
     names: set[str] = set()
     for task in listed:
-        names |= {task.name, task.base}
-    for suite in suites():
-        names |= {task.name for task in tasks(suite)}
+        names |= _names(task)
+    # A faulty file of another suite of the user must not stop the evaluation.
+    for suite in {*SUITES, *selection.suites}:
+        for other in tasks(suite):
+            names |= {other.name, str(other)}
     for pattern in selection.tasks:
         if not fnmatch.filter(names, pattern):
             closest = difflib.get_close_matches(pattern, names, cutoff=0)

@@ -8,6 +8,7 @@ from libero.libero import get_libero_path
 from libero.libero.benchmark import task_maps
 
 from pipeline.errors import PipelineError
+from pipeline.evaluation.selection import Selection, select
 from pipeline.libero.tasks import SUITES, find_task, select_tasks, suites, tasks
 
 
@@ -37,6 +38,11 @@ def test_a_faulty_file_of_another_suite_stops_no_selection(tmp_path: Path, monke
         file.write_text(text)
     assert [str(task) for task in select_tasks(["whole/*"])] == ["whole/light_it"]
     assert select_tasks(["libero_goal/turn_on_the_stove"]) == [stove]
+    for names in (("light_it",), ("whole/light_it",), ("whole/*",), ()):
+        assert [(task.suite, task.base) for task in select(Selection(suites=("whole",), tasks=names))] == [
+            ("whole", "light_it")
+        ]
+    assert [task.base for task in select(Selection(tasks=("libero_goal/turn_on*",)))] == [stove.name]
     for pattern in ("half/*", "*/light_it", "*light*"):
         with pytest.raises(PipelineError, match=r"half/light_it\.bddl: the file is not a BDDL file"):
             select_tasks([pattern])
