@@ -20,7 +20,38 @@ from pipeline.types import Frame
 CAMERAS = {"image": "agentview", "image2": "wrist"}
 """lerobot's name of a view to this project's name."""
 
+FRAME_PX = (256, 256)
+"""Height and width in which the views are rendered."""
+
+NO_DECISION = ("device", "use_amp", "push_to_hub", "repo_id", "private", "tags", "license")
+"""Options of a policy of lerobot that change no action."""
+
 Observation = dict[str, Any]
+
+
+def identity_options(overrides: Sequence[str], rename_map: str | None, size_px: tuple[int, int]) -> str:
+    """Return the options of lerobot-eval that change the policy or its images, as a part of the policy's identity.
+
+    Args:
+        overrides: words of the command about the policy, such as ``--n_action_steps=5``, without the folder.
+        rename_map: value of that option, if it is given.
+        size_px: height and width of the views.
+
+    Returns:
+        The options in alphabetical order, each after a space; empty without such options.
+    """
+    named: list[str] = []
+    for word in overrides:
+        if word.startswith("--"):
+            named.append(word.removeprefix("--"))
+        else:
+            named[-1] += f"={word}"
+    options = [f"policy.{option}" for option in named if option.partition("=")[0] not in NO_DECISION]
+    if rename_map is not None:
+        options.append(f"rename_map={rename_map}")
+    if size_px != FRAME_PX:
+        options.append(f"observation={size_px[0]}x{size_px[1]}")
+    return "".join(f" {option}" for option in sorted(options))
 
 
 def observation_space(size_px: tuple[int, int]) -> spaces.Dict:
@@ -65,7 +96,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         settings: EpisodeSettings,
         first: int = 0,
         stride: int = 1,
-        size_px: tuple[int, int] = (256, 256),
+        size_px: tuple[int, int] = FRAME_PX,
         evaluation: Evaluation | None = None,
         archive: Path | None = None,
     ):

@@ -17,17 +17,17 @@ from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import check_settings
-from pipeline.evaluation.gym_environment import PerturbedLiberoEnv
+from pipeline.evaluation.gym_environment import PerturbedLiberoEnv, identity_options
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 
 try:
-    from lerobot.configs.parser import get_path_arg
+    from lerobot.configs.parser import get_cli_overrides, get_path_arg, parse_arg
     from lerobot.envs.utils import freeze_after_episode_end
 except ImportError as error:
     raise ImportError(
-        "this lerobot accepts no external environments: use lerobot 0.6.1 with Python 3.12 or 3.13, or "
+        "this lerobot cannot run these environments: use lerobot 0.6.1 with Python 3.12 or 3.13, or "
         "`python -m pipeline evaluate OUT --checkpoint DIR`"
     ) from error
 
@@ -115,6 +115,15 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
         for suite_tasks in tasks.values():
             every_task += suite_tasks
         check_settings(selection, every_task, settings)
+        counts = {suite: len(suite_tasks) for suite, suite_tasks in tasks.items()}
+        if len({*counts.values()}) > 1:
+            raise PipelineError(
+                "--eval.n_episodes is one number, and the suites have different numbers of episodes: "
+                f"{', '.join(f'{suite} {number}' for suite, number in counts.items())}",
+                where="env.task",
+                expected="suites with equal numbers of episodes",
+                remedy="evaluate each suite by its own command, with the same --env.out; or set --env.subset",
+            )
         if evaluation is not None:
             evaluation.check(every_task)
         print(gl.choose())  # before the worker processes start, because they inherit the choice
@@ -154,4 +163,6 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
                 remedy="run `hf download REPOSITORY --local-dir DIR`, then set --policy.path=DIR",
             )
         policy = PolicyConfig(kind="checkpoint", address=folder, label=self.label)
-        return Evaluation(settings, policy, policy.identity(), Path(self.out), archive=archive)
+        size_px = self.observation_height, self.observation_width
+        options = identity_options(get_cli_overrides("policy") or (), parse_arg("rename_map"), size_px)
+        return Evaluation(settings, policy, policy.identity() + options, Path(self.out), archive=archive)

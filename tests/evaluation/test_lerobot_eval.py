@@ -10,12 +10,13 @@ import checkpoints
 import numpy as np
 import pytest
 from conftest import STOVE
+from lerobot.configs.parser import get_cli_overrides, parse_arg
 from libero_environment import OffScreenRenderEnv
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment
 from pipeline.evaluation.environment import EpisodeSettings
-from pipeline.evaluation.gym_environment import PerturbedLiberoEnv
+from pipeline.evaluation.gym_environment import PerturbedLiberoEnv, identity_options
 from pipeline.evaluation.results import read, refuse_different, stored
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
@@ -123,6 +124,40 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
         env.close()
 
 
+def test_options_that_change_the_policy_are_part_of_its_identity(tmp_path: Path) -> None:
+    def identity_of(*words: str, size_px: tuple[int, int] = (256, 256)) -> str:
+        command = [f"--policy.path={tmp_path}", "--env.type=perturbed_libero", *words]
+        return identity_options(
+            get_cli_overrides("policy", command) or (), parse_arg("rename_map", command), size_px=size_px
+        )
+
+    assert identity_of() == identity_of("--policy.device=cpu") == ""
+    # As lerobot 0.6.1 returns an option and its value in two words.
+    assert identity_options(["--n_action_steps", "5", "--device", "cuda"], None, (256, 256)) == identity_of(
+        "--policy.n_action_steps=5"
+    )
+    both = ["--policy.n_action_steps=5", "--policy.temporal_ensemble_coeff=0.01"]
+    assert identity_of(*both) == identity_of(*both[::-1]) == f" {both[0][2:]} {both[1][2:]}"
+    assert identity_of("--rename_map={}", size_px=(360, 360)) == " observation=360x360 rename_map={}"
+    # Results of both under one label are refused.
+    policy = PolicyConfig(kind="checkpoint", address=str(checkpoints.save(tmp_path / "act", 0.0)), label="act")
+    settings = EpisodeSettings(runner="lerobot-eval", own_step_limit=None)
+    for options in ("", identity_of(both[0])):
+        evaluation = Evaluation(settings, policy, policy.identity() + options, tmp_path / "rows")
+        listed = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+        if options:
+            with pytest.raises(PipelineError, match=r"two policies have the name 'act'(?s:.*)n_action_steps=5"):
+                evaluation.check(listed)
+            return
+        evaluation.check(listed)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(STEP_LIMITS, STOVE.suite, 1)
+            env = PerturbedLiberoEnv(listed, settings, evaluation=evaluation)
+            env.reset()
+            env.step(np.zeros(7, np.float32))
+            env.close()
+
+
 def test_limits_of_openvla_and_lerobot_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(STEP_LIMITS, "libero_spatial", 1)
     monkeypatch.setattr(environment, "LEROBOT_SPATIAL", 2)
@@ -154,5 +189,9 @@ def test_it_registers_where_lerobot_takes_environments() -> None:
     own = import_module("lerobot.envs.configs").LiberoEnv(observation_height=224, observation_width=224)
     assert config.type == "perturbed_libero"
     assert (config.features, config.features_map) == (own.features, own.features_map)
+    with pytest.raises(PipelineError, match=r"different numbers of episodes: libero_goal 4\d\d, libero_spatial 3\d\d"):
+        import_module(name).PerturbedLibero(
+            task="libero_goal,libero_spatial", source="libero_plus", axes=["camera"]
+        ).create_envs(1)
     with pytest.raises(PipelineError, match="no source"):
         import_module(name).PerturbedLibero(source="own").create_envs(1)
