@@ -158,8 +158,8 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
                 expected="the noun of an instruction for the objects, in lower case, such as bottle_of_milk",
                 remedy="rename the folder",
             )
-        hashed = [(file.relative_to(path.parent).as_posix(), checksum(file)) for file in (path, *files_of[path])]
-        made_from = digest("object", RECIPE, path.name, hashed)
+        hashed = [(file.name, checksum(file)) for file in (path, *files_of[path])]
+        made_from = digest("object", RECIPE, hashed)
         # The name holds a hash of the model's origin, so that an earlier plan still finds its own objects.
         name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
         about = {"made_from": made_from, "category": category, "licence": source.licence}
@@ -176,18 +176,18 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """List the files that a user's model names, in order of their paths.
+    """List the files that a user's model names.
 
     Raises:
-        PipelineError: when the model cannot be read, or a file is missing, damaged, or outside of the model's folder.
+        PipelineError: when the model cannot be read, or a file is missing. Also when a picture of an OBJ is damaged, or
+            a file of an MJCF is outside of the model's folder.
     """
     if path.suffix.lower() == ".obj":
-        files = material_files(path)
-    else:
-        try:
-            files = [path.parent / asset.attrib["file"] for asset in ET.parse(path).iterfind("asset/*[@file]")]
-        except (OSError, ET.ParseError) as error:
-            raise PipelineError(f"the model is not readable ({error})", where=path) from error
+        return material_files(path)
+    try:
+        files = [path.parent / asset.attrib["file"] for asset in ET.parse(path).iterfind("asset/*[@file]")]
+    except (OSError, ET.ParseError) as error:
+        raise PipelineError(f"the model is not readable ({error})", where=path) from error
     for file in files:
         if not file.resolve().is_relative_to(path.parent.resolve()):
             raise PipelineError(
@@ -202,7 +202,7 @@ def _files_of(path: Path) -> list[Path]:
                 where=path,
                 remedy="put the file there, or correct its name in the model",
             )
-    return sorted(set(files))
+    return files
 
 
 def _check(mjcf: Path, path: Path) -> None:

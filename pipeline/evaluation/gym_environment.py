@@ -23,8 +23,8 @@ CAMERAS = {"image": "agentview", "image2": "wrist"}
 FRAME_PX = (256, 256)
 """Height and width in which the views are rendered."""
 
-NO_DECISION = ("device", "use_amp", "push_to_hub", "repo_id", "private", "tags", "license")
-"""Options of a policy of lerobot that change no action."""
+NO_DECISION = ("device", "push_to_hub", "repo_id", "private", "tags", "license")
+"""Options of a policy of lerobot that are not part of its identity, as in `evaluate`."""
 
 Observation = dict[str, Any]
 

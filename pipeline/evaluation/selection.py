@@ -10,7 +10,7 @@ import difflib
 import fnmatch
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from itertools import combinations, count, islice, product
+from itertools import chain, combinations, count, islice, product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -218,15 +218,15 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
     """Return whether a task matches the names and the other restrictions of a selection."""
-    named = not selection.tasks or any(fnmatch.filter(_names(task), pattern) for pattern in selection.tasks)
+    named = not selection.tasks or any(fnmatch.filter(_names(task, pattern), pattern) for pattern in selection.tasks)
     asked = {column: getattr(selection, field) for field, column in COLUMNS.items()}
     return named and all(not values or getattr(task, column) in values for column, values in asked.items())
 
 
-def _names(task: EvaluationTask) -> set[str]:
-    """Return the names that a pattern may match: of the task and its LIBERO task, alone and after the suite."""
-    names = {task.name, task.base}
-    return names | {f"{task.suite}/{name}" for name in names}
+def _names(task: EvaluationTask, pattern: str) -> set[str]:
+    """Return the names of a task and its LIBERO task, after the suite if the pattern has a slash."""
+    suite = f"{task.suite}/" if "/" in pattern else ""
+    return {suite + task.name, suite + task.base}
 
 
 def _of_unknown_level(listed: Sequence[EvaluationTask], selection: Selection) -> Counter[str]:
@@ -249,14 +249,12 @@ def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> Non
         _check_known(field, getattr(selection, field), values, selection)
     if not selection.tasks:
         return
-    names: set[str] = set()
-    for task in listed:
-        names |= _names(task)
     # A faulty file of another suite of the user must not stop the evaluation.
-    for suite in {*SUITES, *selection.suites}:
-        for other in tasks(suite):
-            names |= {other.name, str(other)}
+    known = [*chain.from_iterable(map(tasks, {*SUITES, *selection.suites}))]
     for pattern in selection.tasks:
+        names = {str(task) if "/" in pattern else task.name for task in known}
+        for task in listed:
+            names |= _names(task, pattern)
         if not fnmatch.filter(names, pattern):
             closest = difflib.get_close_matches(pattern, names, cutoff=0)
             raise PipelineError(f"no task is named {pattern!r}", where="tasks", expected=" or ".join(closest))
