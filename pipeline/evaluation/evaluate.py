@@ -210,8 +210,8 @@ def _check_own_tasks(wanted: Sequence[EvaluationTask], settings: EpisodeSettings
         raise PipelineError(
             f"LIBERO has no step limit for your suite {longest.suite}",
             where="own_step_limit",
-            expected=f"more than {steps[longest]} steps, as the longest demonstration of {longest.name} has; LIBERO's limits "
-            "are 3 to 14 % above its longest demonstrations",
+            expected=f"more than the {steps[longest]} steps of the longest demonstration of {longest.name}; LIBERO's "
+            "limits are 3 to 14 % above its longest demonstrations",
             remedy="add --own-step-limit N",
         )
     settings.step_limit(own_tasks[0].suite)
