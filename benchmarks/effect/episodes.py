@@ -5,7 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -103,9 +103,9 @@ def _link_files_of_other_arms(folder: Path) -> None:
 
     A file is named after its content, so a file of the same name is the same.
     """
-    for name in (TRAJECTORIES, FRAMES):
-        for file in folder.parent.glob(f"*/{name}/**/*{SUFFIX}"):
-            here = folder / name / file.relative_to(next(above for above in file.parents if above.name == name))
+    for other, name in product(folder.parent.glob("*/"), (TRAJECTORIES, FRAMES)):
+        for file in (other / name).rglob(f"*{SUFFIX}"):
+            here = folder / file.relative_to(other)
             if not here.exists():
                 here.parent.mkdir(parents=True, exist_ok=True)
                 here.hardlink_to(file)

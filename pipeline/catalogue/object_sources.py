@@ -14,6 +14,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -137,7 +138,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
     visible = sorted(path for path in source.folder.glob("*/*") if not path.name.startswith("."))
     files_of = {path: _files_of(path) for path in visible if path.suffix.lower() == ".xml"}
     # The meshes of an MJCF model are no models of their own.
-    meshes = {file.resolve() for files in files_of.values() for file in files}
+    meshes = {file.resolve() for file in chain.from_iterable(files_of.values())}
     for path in visible:
         if path.suffix.lower() == ".obj" and path.resolve() not in meshes:
             files_of[path] = _files_of(path)

@@ -28,7 +28,7 @@ from pipeline.evaluation.tasks import EvaluationTask, goal_task
 from pipeline.files import write, write_json
 from pipeline.images.mp4 import mp4
 from pipeline.libero.tasks import SUITES, find_task
-from pipeline.types import Frame
+from pipeline.types import Frame, Task
 
 EPISODES_A_JOB = 10
 """Largest number of episodes in a job. Smaller jobs spread better over workers; larger jobs build fewer scenes."""
@@ -204,9 +204,11 @@ def _check_own_tasks(wanted: Sequence[EvaluationTask], settings: EpisodeSettings
             )
         return
     if settings.own_step_limit is None and settings.demos is not None:
-        named = [find_task(suite, name) for suite, name in sorted({(task.suite, task.base) for task in own_tasks})]
-        steps = {task: recordings.longest_steps(task, settings.demos) for task in named}
-        longest = max(named, key=lambda task: steps[task])
+        steps: dict[Task, int] = {}
+        for suite, name in sorted({(task.suite, task.base) for task in own_tasks}):
+            own_task = find_task(suite, name)
+            steps[own_task] = recordings.longest_steps(own_task, settings.demos)
+        longest = max(steps, key=lambda task: steps[task])
         raise PipelineError(
             f"LIBERO has no step limit for your suite {longest.suite}",
             where="own_step_limit",

@@ -248,7 +248,7 @@ def test_a_model_without_its_picture_is_refused(folder: Path, tmp_path: Path, mo
             '<worldbody><body><geom type="box" size=".02 .02 .02" material="m"/></body></worldbody></mujoco>'
         )
     picture = (mine / "roof.png").read_bytes()
-    # Each damage has its own file, as MuJoCo keeps what it has read from a file.
+    # The intact picture comes last: MuJoCo does not read a file again in the same second.
     (mine / "roof.png").unlink()
     if damage != "missing":
         (mine / "roof.png").write_bytes(b"no image" if damage == "no image" else picture[: len(picture) // 2])

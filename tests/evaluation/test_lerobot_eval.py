@@ -124,7 +124,9 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
         env.close()
 
 
-def test_options_that_change_the_policy_are_part_of_its_identity(tmp_path: Path) -> None:
+def test_options_that_change_the_policy_are_part_of_its_identity(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def identity_of(*words: str, size_px: tuple[int, int] = (256, 256)) -> str:
         command = [f"--policy.path={tmp_path}", "--env.type=perturbed_libero", *words]
         return identity_options(
@@ -141,21 +143,16 @@ def test_options_that_change_the_policy_are_part_of_its_identity(tmp_path: Path)
     assert identity_of("--rename_map={}", size_px=(360, 360)) == " observation=360x360 rename_map={}"
     # Results of both under one label are refused.
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoints.save(tmp_path / "act", 0.0)), label="act")
-    settings = EpisodeSettings(runner="lerobot-eval", own_step_limit=None)
-    for options in ("", identity_of(both[0])):
-        evaluation = Evaluation(settings, policy, policy.identity() + options, tmp_path / "rows")
-        listed = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
-        if options:
-            with pytest.raises(PipelineError, match=r"two policies have the name 'act'(?s:.*)n_action_steps=5"):
-                evaluation.check(listed)
-            return
-        evaluation.check(listed)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(STEP_LIMITS, STOVE.suite, 1)
-            env = PerturbedLiberoEnv(listed, settings, evaluation=evaluation)
-            env.reset()
-            env.step(np.zeros(7, np.float32))
-            env.close()
+    settings, rows = EpisodeSettings(runner="lerobot-eval"), tmp_path / "rows"
+    listed = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+    monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 1)
+    env = PerturbedLiberoEnv(listed, settings, evaluation=Evaluation(settings, policy, policy.identity(), rows))
+    env.reset()
+    env.step(np.zeros(7, np.float32))
+    env.close()
+    with_options = Evaluation(settings, policy, policy.identity() + identity_of(both[0]), rows)
+    with pytest.raises(PipelineError, match=r"two policies have the name 'act'(?s:.*)n_action_steps=5"):
+        with_options.check(listed)
 
 
 def test_limits_of_openvla_and_lerobot_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
