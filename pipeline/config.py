@@ -335,15 +335,20 @@ class Config(Frozen):
         return self
 
     @model_validator(mode="after")
-    def _replay_corrects_pushes(self) -> Config:
-        if not self.plan.axes.disturbance:
-            return self
-        if self.replay.noops != "drop":
+    def _replay_suits_axes(self) -> Config:
+        axes = self.plan.axes
+        if axes.disturbance and self.replay.noops != "drop":
             raise ValueError("the axis disturbance requires replay.noops: drop, as pushes count steps without no-ops")
         if self.replay.mode == "open_loop":
-            raise ValueError(
-                "the axis disturbance requires replay.mode: auto or tracked, as recorded actions do not correct pushes"
-            )
+            if axes.disturbance:
+                raise ValueError(
+                    "the axis disturbance requires replay.mode: auto or tracked, as recorded actions do not correct "
+                    "pushes"
+                )
+            if axes.goal:
+                raise ValueError(
+                    "the axis goal requires replay.mode: auto or tracked, as its objects stand elsewhere than recorded"
+                )
         return self
 
     @model_validator(mode="after")
@@ -460,5 +465,5 @@ def validate(content: Any, path: Path) -> Config:
         raise PipelineError(
             f"the configuration is not valid:\n    {faults}",
             where=path,
-            remedy="look up the fields in docs/configuration.md",
+            remedy="look up the fields in docs/fields.md",
         ) from error

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
+from pipeline.axes import axes_of
 from pipeline.axes.component_names import ComponentName
 from pipeline.episode_schema import STANDARD, Content
 from pipeline.formats.base import Format, FormatOptions, Options
@@ -40,6 +41,11 @@ class Where(Frozen):
     component: tuple[ComponentName, ...] | None = Field(default=None, min_length=1)
     level: tuple[Annotated[int, Field(ge=0, le=5)], ...] | None = Field(default=None, min_length=1)
     suite: tuple[str, ...] | None = Field(default=None, min_length=1)
+
+    @field_validator("axis")
+    @classmethod
+    def _in_the_order_of_the_plan(cls, axis: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        return axis and tuple("+".join(axes_of(name)) if "+" in name else name for name in axis)
 
     def takes(self, axis: str, component: str, level: str, suite: str) -> bool:
         """Return whether an episode is written, by its columns of the plan."""

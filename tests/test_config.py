@@ -275,15 +275,16 @@ def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("replay", "message"),
+    ("axis", "replay", "message"),
     [
-        ("noops: keep", r"disturbance requires replay\.noops: drop"),
-        ("mode: open_loop", r"disturbance requires replay\.mode: auto or tracked"),
+        ("disturbance", "noops: keep", r"disturbance requires replay\.noops: drop"),
+        ("disturbance", "mode: open_loop", r"disturbance requires replay\.mode: auto or tracked"),
+        ("goal", "mode: open_loop", r"goal requires replay\.mode: auto or tracked"),
     ],
 )
-def test_pushes_go_with_dropped_no_ops_and_tracking(replay: str, message: str, tmp_path: Path) -> None:
-    file = tmp_path / "pushed.yaml"
-    file.write_text(f"{{name: pushed, plan: {{episodes: {{disturbance: 1}}}}, replay: {{{replay}}}}}")
+def test_axes_refuse_a_replay_that_cannot_perform_them(axis: str, replay: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text(f"{{name: run, plan: {{episodes: {{{axis}: 1}}}}, replay: {{{replay}}}}}")
     with pytest.raises(PipelineError, match=message):
         load(file)
 

@@ -82,6 +82,8 @@ AXIS_IS_SUBJECT = {
     *("pipeline.evaluation.tasks", "pipeline.evaluation.selection"),
     # What two axes do to a scene, which sampling a plan must not load.
     *("pipeline.scenes.placement", "pipeline.scenes.moving"),
+    # The axis whose exported episodes are no demonstrations.
+    "pipeline.libero.demonstrations",
     # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
     *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write"),
     *("pipeline.formats.lerobot.language", "pipeline.validation.checks"),

@@ -20,7 +20,6 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +33,7 @@ from pipeline.evaluation import own_draws
 from pipeline.evaluation.results import REFUSED, EpisodeFiles, EpisodeResult
 from pipeline.evaluation.task_list import write_tasks
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import checksum, write
+from pipeline.files import checksum, read_json, write
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.run.claim import owned
@@ -109,6 +108,7 @@ class Work:
     def evaluate(self, arm: str, seed: int, kept: Path) -> Path:
         """Evaluate a policy; write its results into the folder ``kept``, to be committed, and return the file."""
         import evaluation
+        import training
         from results import PolicyResults
         from server_process import running
 
@@ -132,16 +132,19 @@ class Work:
                 options = (*server, "--trained-on", str(held_out.config))
                 rows += run_tests(held_out.tests, folder / "held_out", *options, plan_sha256=held_out.plan_sha256)
             reading = evaluation.run_instructed_episodes(self.experiment, address, folder / "reading")
-        dataset = self.dataset(arm)
+        dataset = episodes.read(self.dataset(arm))
         losses = (policy / "training.jsonl").read_text().splitlines()
         made: dict[str, Any] = {
-            "dataset_sha256": checksum(dataset),
-            "episodes_by_axis": episodes.read(dataset).axes(),
+            "dataset_sha256": checksum(self.dataset(arm)),
+            "episodes_by_axis": dataset.axes(),
+            "demonstrations": len({row["demo_id"] for row in dataset.episodes}),
+            "frames": int(dataset.lengths.sum()),
             "sentences_sha256": checksum(sentences.FILE),
             "policy_sha256": weights,
             "plan_of_all_arms_sha256": held_out.plan_sha256 if held_out else None,
             "losses": [[entry["step"], entry["loss"]] for entry in map(json.loads, losses[9::10])],
-            "packages": {name: version(name) for name in ("torch", "torchvision", "lerobot")},
+            "trained_with": read_json(policy / training.TRAINED_WITH, "train the policy again"),
+            "packages": training.trained_with()["packages"],
             "seconds": self._seconds(),
             "cores": os.cpu_count(),
         }
@@ -188,7 +191,7 @@ class Work:
                 file.write(json.dumps({"part": name, **taken}) + "\n")
 
     def _seconds(self) -> dict[str, list[float]]:
-        """Return part to its wall and CPU seconds, stopped commands included."""
+        """Return part to its wall and CPU seconds, with those of interrupted commands, but not of killed ones."""
         taken: dict[str, list[float]] = {}
         for entry in map(json.loads, (self.out / "times.jsonl").read_text().splitlines()):
             seconds, cpu_s = taken.get(entry["part"], (0.0, 0.0))

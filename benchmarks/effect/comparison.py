@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from instructions import at_own_place
-from results import PolicyResults, read
+from results import PolicyResults, join, read
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult, Trial
@@ -39,9 +39,14 @@ LINES = {
     "light": "light, held out",
     "background": "background, held out",
     "layout": "added objects, held out",
+    "camera, held out": "camera, held out",
+    "noise, held out": "noise, held out",
     "goal": "held-out goals elsewhere",
     "goal, own place": "held-out goals at their own place",
 }
+FIRST_STATE = ("robot", "language", "camera", "noise")
+"""Axes whose test tasks of LIBERO-Plus have the objects where LIBERO's first initial state has them."""
+
 OWN_PLACE = ", own place"
 """End of the names of lines and kinds whose thing stands in the scene where it stands in the asked task's own scene."""
 KINDS = {
@@ -63,8 +68,11 @@ def line_of(policy: PolicyResults, row: EpisodeResult) -> str:
 
     Camera and noise share a line in experiments with few tests of both, those without held-out perturbations.
     """
-    if row.axis in ("camera", "noise") and "held_out" not in policy.settings["evaluation"]:
-        return "camera, noise"
+    if row.axis in ("camera", "noise"):
+        if row.source == "own":
+            return f"{row.axis}, held out"
+        if "held_out" not in policy.settings["evaluation"]:
+            return "camera, noise"
     if row.axis != "goal":
         return row.axis
     (asked,) = (task.name for task in tasks(row.suite) if task.instruction == row.instruction)
@@ -203,6 +211,10 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     if rows:
         text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n"
         text += _table(rows)
+    rows = _first_state_rows(results)
+    if rows:
+        text += "\nSuccess on LIBERO-Plus's tests of tasks whose first state a policy solves unperturbed:\n\n"
+        text += _table(rows)
     readings = chain.from_iterable(policy.reading for policy in results)
     if len({row["scene"] for row in readings}) > 1:
         text += "\nReached goals by instruction, all scenes and seeds together:\n\n"
@@ -228,18 +240,50 @@ def _success_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     return rows
 
 
+def _first_state_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
+    """Return the success on tests of ``FIRST_STATE``, without tasks whose unperturbed first state no policy solves.
+
+    An empty list if there is no such task.
+    """
+    unsolved: set[str] = set()
+    solved: set[str] = set()
+    for policy in results:
+        for row in policy.rows:
+            if row.source == "libero" and row.number == 0:
+                (solved if row.success else unsolved).add(row.base)
+    if unsolved <= solved:
+        return []
+    arms = arms_of(results)
+    rows = [["tests", "episodes", *arms]]
+    for axis in FIRST_STATE:
+        of_arms: dict[str, list[list[bool]]] = {arm: [] for arm in arms}
+        for policy in results:
+            tests = [row for row in policy.rows if row.source == "libero_plus" and row.axis == axis]
+            of_arms[policy.arm].append([row.success for row in tests if row.base in solved])
+        episodes = max(len(trials) for trials in chain.from_iterable(of_arms.values()))
+        if episodes:
+            rows.append([axis, str(episodes), *map(_rates, of_arms.values())])
+    return rows
+
+
 def _difference_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     """Return the differences by line and pair of arms; an empty list if there is no pair."""
     cells: dict[str, dict[str, str]] = defaultdict(dict)
     for row in differences(results):
         bounds = "" if row["low"] is None else f" ({100 * row['low']:+.0f} to {100 * row['high']:+.0f})"
         pair = f"{row['second']} - {row['first']}"
-        p_value = f", p {row['holm']:.2g}" if row["holm"] < 1 else ""
-        cells[LINES[row["line"]]][pair] = f"{100 * row['value']:+.0f}{bounds}{p_value}"
+        cells[LINES[row["line"]]][pair] = f"{100 * row['value']:+.0f}{bounds}{_p_value(row['holm'])}"
     if not cells:
         return []
     pairs = next(iter(cells.values()))
     return [["tests", *pairs], *([line, *texts.values()] for line, texts in cells.items())]
+
+
+def _p_value(p_value: float) -> str:
+    """Return the text of a p-value; of very small ones only the order, as resampling does not compute them."""
+    if p_value < 0.01:
+        return ", p < 0.01"
+    return f", p {p_value:.2g}" if p_value < 1 else ""
 
 
 def _reading_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
@@ -345,8 +389,10 @@ def publish(folder: Path, docs: Path = DOCS, log: Path = LOG) -> str:
     _write(log, "experiment", markdown(read(folder)))
     for further in sorted(FURTHER.iterdir()):
         if further.name != SHOWN:
-            joined = read(FURTHER / BESIDE[further.name]) if further.name in BESIDE else []
-            _write(log, further.name, markdown([*joined, *read(further)]))
+            results = read(further)
+            if further.name in BESIDE:
+                results = join(read(FURTHER / BESIDE[further.name]), results, further)
+            _write(log, further.name, markdown(results))
     return text
 
 

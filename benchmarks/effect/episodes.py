@@ -112,10 +112,10 @@ def _link_files_of_other_arms(folder: Path) -> None:
 
 
 def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tuple[list[plan.Row], list[plan.Row]]:
-    """Plan an arm with one episode per demonstration; return all rows, and the rows that the arm may use.
+    """Plan an arm with one wanted episode per demonstration; return all rows, and the rows that the arm may use.
 
-    All other rows are the clean twins of demonstrations with perturbed episodes. Arms of ``further`` also get the
-    perturbed episodes of their runs.
+    A reserve that replaces a failed episode may be of any demonstration of its task. All other rows are the clean twins
+    of demonstrations with perturbed episodes. Arms of ``further`` also get the perturbed episodes of their runs.
 
     Raises:
         PipelineError: if a task has fewer demonstrations than wanted.

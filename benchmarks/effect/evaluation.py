@@ -51,9 +51,9 @@ def tested(experiment: Experiment) -> list[EvaluationTask]:
 def held_out_tests(experiment: Experiment, trained: PlannedDraws) -> list[EvaluationTask]:
     """Select held-out perturbations of each task, equally for all arms.
 
-    Each test has a sample that keeps its clearance from the episodes of all arms. ``evaluate --trained-on`` takes the
-    first such sample that the scene accepts. Levels take turns as far as they have such samples: perturbations with
-    many textures or objects rarely have one.
+    Each test has a sample that keeps its clearance from the episodes of all arms. Light has no clearance: only equal
+    perturbations are avoided. ``evaluate --trained-on`` takes the first such sample that the scene accepts. Levels take
+    turns as far as they have such samples: perturbations with many textures or objects rarely have one.
 
     Raises:
         PipelineError: if a task has too few such perturbations.

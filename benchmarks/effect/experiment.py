@@ -21,8 +21,12 @@ from pipeline.seeding import digest
 PlusAxis = Literal["robot", "language", "pose", "camera", "noise"]
 """Axes whose test tasks need no asset archive."""
 
-HeldOutAxis = Literal["light", "background", "layout"]
-"""Axes of the paper whose test tasks need the asset archive, tested by held-out perturbations of this project."""
+HeldOutAxis = Literal["light", "background", "layout", "camera", "noise"]
+"""Axes tested by held-out perturbations of this project.
+
+The test tasks of the first three need the asset archive. All test tasks of camera and noise start in one state of each
+task.
+"""
 
 MOST_EPISODES = 350
 """Limit of the episodes of a policy's evaluation, about 25 minutes of two cores."""

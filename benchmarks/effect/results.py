@@ -1,7 +1,7 @@
 """Results of each policy in one small file; tables and plots are generated from these files."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,9 @@ class PolicyResults:
     Attributes:
         arm, seed: arm and seed of its training.
         settings: settings of the experiment, and the tasks.
-        made: hashes of data, sentences and policy, axes of the episodes, losses, packages, and times of the steps.
+        made: hashes of data, sentences and policy; axes of the episodes, numbers of frames and of different
+            demonstrations; losses; packages of the training (``trained_with``, since 2026-11-29) and of the evaluation;
+            times of the steps.
         rows: episodes of test tasks.
         reading: rows of ``evaluation.run_instructed_episodes``.
         black: ``task``, ``state`` and ``success`` from LIBERO's own states with both views black.
@@ -37,10 +39,13 @@ class PolicyResults:
         versions: dict[str, Any] = {}
         if self.rows:
             versions = {name: text for name, text in self.rows[0].versions.items() if name not in RECORDED}
+        packages = self.made.get("packages")
         return {
             "settings": self.settings,
             "sentences": self.made.get("sentences_sha256"),
-            "packages": self.made.get("packages"),
+            "packages": packages,
+            # Results before 2026-11-29 do not state the packages of the training.
+            "packages of the training": self.made.get("trained_with", {}).get("packages", packages),
             "plans of all arms": self.made.get("plan_of_all_arms_sha256"),
             "versions": versions,
         }
@@ -84,17 +89,36 @@ def read(folder: Path) -> list[PolicyResults]:
         columns, common = content.pop("columns"), content.pop("common")
         rows = [EpisodeResult(**common, **dict(zip(columns, row, strict=True))) for row in content.pop("rows")]
         policies.append(PolicyResults(**content, rows=rows))
-        first = policies[0].made_by()
-        for name, made_by in policies[-1].made_by().items():
-            if made_by != first[name]:
-                raise PipelineError(
-                    f"{name} differ from those of the other results in this folder",
-                    where=file,
-                    expected="one experiment",
-                    remedy="evaluate all policies under the same experiment, or move the older results away",
-                )
+        _refuse_different(policies[0], policies[-1], policies[0].made_by(), file)
     if not policies:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")
     settings = policies[0].settings
     arms = [*settings["arms"], *settings.get("further", ())]
     return sorted(policies, key=lambda policy: (arms.index(policy.arm), policy.seed))
+
+
+def join(first: Sequence[PolicyResults], second: Sequence[PolicyResults], where: Path) -> list[PolicyResults]:
+    """Join the policies of two experiments with different arms.
+
+    Args:
+        where: folder of the second experiment's results, for the message of an error.
+
+    Raises:
+        PipelineError: if sentences, packages or versions differ.
+    """
+    for policy in second:
+        _refuse_different(first[0], policy, ("sentences", "packages", "packages of the training", "versions"), where)
+    return [*first, *second]
+
+
+def _refuse_different(first: PolicyResults, second: PolicyResults, names: Iterable[str], where: Path) -> None:
+    """Raise a ``PipelineError`` if two policies differ in a setting or version of ``made_by``."""
+    made_by_first, made_by_second = first.made_by(), second.made_by()
+    for name in names:
+        if made_by_first[name] != made_by_second[name]:
+            raise PipelineError(
+                f"{name} differ from those of the other compared results",
+                where=where,
+                expected="one experiment",
+                remedy="evaluate all policies under the same experiment, or move the older results away",
+            )

@@ -490,6 +490,9 @@ def test_from_demonstrations_to_the_results(
     ]
     assert found.black == [{"task": STOVE.name, "state": 0, "success": False}]
     assert found.made["episodes_by_axis"] == {"clean": 1, "noise": 1}
+    (dataset,) = Path("data/effect/datasets").glob("more_*.npz")
+    assert (found.made["demonstrations"], found.made["frames"]) == (2, len(np.load(dataset)["action"]))
+    assert found.made["trained_with"]["packages"] == found.made["packages"]
     (clean,), (more,) = (list(Path("data/effect/datasets").glob(f"{arm}_*/")) for arm in ("clean", "more"))
     files = {file.relative_to(clean) for file in clean.glob("*/**/*.npz")}
     assert {file.parts[0] for file in files} == {"trajectories", "frames"}

@@ -8,6 +8,7 @@ import json
 import math
 import time
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from states import relative_by_episode
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from pipeline.files import remove, replaced
+from pipeline.run.finished import host
 from pipeline.seeding import rng
 
 IMAGES = {view: f"observation.images.{view}" for view in VIEWS}
@@ -43,6 +45,11 @@ LOG_EVERY = 50
 
 PROPRIOCEPTION = "proprioception.json"
 """File of a policy with the value of this setting, which its server needs."""
+
+TRAINED_WITH = "trained_with.json"
+"""File of a policy with the ``packages`` and ``processors`` that finished its training."""
+
+PACKAGES = ("torch", "torchvision", "lerobot")
 
 Batch = dict[str, torch.Tensor]
 
@@ -105,8 +112,15 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
         for part in (policy, before, after):
             part.save_pretrained(folder)
         (folder / PROPRIOCEPTION).write_text(json.dumps(config.proprioception))
+        (folder / TRAINED_WITH).write_text(json.dumps(trained_with()))
         (folder / "training.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in log))
     remove(work)
+
+
+def trained_with() -> dict[str, Any]:
+    """Return the versions of ``PACKAGES``, and the models of this machine's processors."""
+    _, processors = host()
+    return {"packages": {name: version(name) for name in PACKAGES}, "processors": processors}
 
 
 def configuration(experiment: Experiment) -> ACTConfig:

@@ -25,6 +25,7 @@ from pipeline.catalogue.data_maps import DATA_MAPS
 from pipeline.catalogue.procedural import COLOUR_MAPS
 from pipeline.catalogue.texture_sources import Source, Texture, keep
 from pipeline.errors import PipelineError
+from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Frame, Task
 
@@ -195,7 +196,7 @@ class BackgroundAxis(Axis):
 
     def offered(self) -> dict[str, int]:
         """Count the distinct textures of ``sources``, and the procedural ones."""
-        listed = textures.catalogue(self.sources).values()
+        listed = _catalogue(self.sources).values()
         return {
             "surfaces": len({texture.sha256 for texture in listed}),
             "procedural": sum(texture.source == "procedural" for texture in listed),
@@ -250,12 +251,27 @@ class BackgroundAxis(Axis):
 @cache
 def _offered(sources: tuple[Source, ...], families: tuple[str | None, ...]) -> list[Texture]:
     """List the textures of some families; images have the family ``None``."""
-    return [texture for texture in textures.catalogue(sources).values() if texture.family in families]
+    return [texture for texture in _catalogue(sources).values() if texture.family in families]
+
+
+@cache
+def _catalogue(sources: tuple[Source, ...]) -> dict[str, Texture]:
+    """Collect the textures of some sources, as ``textures.catalogue``.
+
+    Raises:
+        PipelineError: also when a user's image has the name of an image that test tasks show; it would never be
+            sampled.
+    """
+    listed = textures.catalogue(sources)
+    for texture in listed.values():
+        if texture.own is not None and textures.normalise(texture.name) in _images_of(benchmark.load()):
+            raise textures.unusable(texture, textures.TESTED_NAME)
+    return listed
 
 
 @cache
 def _images_of(test: TestSet) -> frozenset[str]:
-    """Return the normalised names of the images that test tasks show."""
+    """Return the normalised names of the images that test tasks show: LIBERO's walls, and the benchmark's surfaces."""
     names: set[str] = set()
     for tested in test.on_axis("background"):
         for part in ("surface", "wall"):
@@ -267,7 +283,8 @@ def _images_of(test: TestSet) -> frozenset[str]:
 
 def _is_tested(covering: Covering, test: TestSet) -> bool:
     """Return whether a test task shows the covering's image, by its name or its bytes."""
-    return textures.normalise(covering.texture) in _images_of(test) or covering.sha256 in textures.test_images()
+    has_tested_name = textures.normalise(covering.texture) in _images_of(test)
+    return has_tested_name or covering.sha256 in textures.test_images()
 
 
 class Skin(NamedTuple):

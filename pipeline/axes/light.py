@@ -122,7 +122,8 @@ class LightRange(Frozen):
     diffuse light as they become glossier. Otherwise one-pass lighting would cut highlights off at the surface's colour.
 
     Attributes:
-        brightness_scale: Intervals of the multiple of the diffuse light.
+        brightness_scale: Intervals of the multiple of the diffuse light. In the kitchen and in combination with
+            shadows, intervals are cut at 1; without an interval below 1, the light is only tinted.
         saturation: Intervals of the saturation of tinted diffuse light, in any hue: 0 is white, 1 is a pure colour.
         specular_scale: Intervals of the multiple of the specular light. Above 1, surfaces become glossier too.
         tilt_deg: Intervals of the angle by which lamps are turned in place, in degrees.
@@ -203,11 +204,11 @@ class LightAxis(Axis):
         ranges = self.ranges[level - 1]
         match component:
             case "diffuse":
+                scales = ranges.brightness_scale
+                if brightest:
+                    scales = tuple((low, min(high, 1.0)) for low, high in scales if low < 1)
                 # Not both: a brighter lamp drives its tint back to white.
-                if rng.random() < 0.5:
-                    scales = ranges.brightness_scale
-                    if brightest:
-                        scales = tuple((low, min(high, 1.0)) for low, high in scales if low < 1) or scales
+                if rng.random() < 0.5 and scales:
                     return {"diffuse_scale_rgb": [draw(rng, scales)] * 3}
                 tint = colorsys.hsv_to_rgb(rng.random(), draw(rng, ranges.saturation), 1.0)
                 return {"diffuse_scale_rgb": [round(channel, 4) for channel in tint]}

@@ -172,7 +172,7 @@ def kept(name: str, sha256: str) -> Texture:
             f"the texture {name} is {'missing' if texture is None else 'damaged'}",
             where=file,
             remedy=f"{'' if texture is None else 'move the file away, then '}copy {FOLDER} from the machine that "
-            "planned the run, or run python stages/plan.py CONFIG",
+            "planned the run, or move its plan.parquet away and run python stages/plan.py CONFIG",
         )
     return texture
 

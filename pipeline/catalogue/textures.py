@@ -54,6 +54,8 @@ _DATA_MAP = re.compile(
 )
 """Pattern in the names of data maps, which hold a surface's reflection or relief instead of its colour."""
 
+TESTED_NAME = "it has the name of an image that test tasks show"
+
 
 @cache
 def normalise(name: str) -> str:
@@ -76,9 +78,9 @@ def refusal(name: str, sha256: str) -> str | None:
     if sha256 in test_images():
         return "its bytes are those of an image that test tasks show"
     if normalise(name) in {normalise(used) for used in IN_TEST_SET}:
-        return "it has the name of an image that test tasks show"
+        return TESTED_NAME
     if _DATA_MAP.search(re.split(r"[/\\:]", name)[-1]):
-        return "its name is that of a data map, not of a colour map"
+        return "its name is that of a data map; rename it if it is a colour map"
     return None
 
 
@@ -100,6 +102,11 @@ def catalogue(sources: tuple[Source, ...]) -> dict[str, Texture]:
                 seen.add(texture.sha256)
                 by_name[texture.name] = texture
     return by_name
+
+
+def unusable(texture: Texture, reason: str) -> PipelineError:
+    """Return the error about a user's image that must not be sampled."""
+    return PipelineError(f"this image cannot be used: {reason}", where=texture.own, remedy="move it out of the folder")
 
 
 def find(name: str, sha256: str) -> Texture:
@@ -136,9 +143,7 @@ def _may_be_drawn(texture: Texture, source: Source) -> bool:
     reason = refusal(texture.name, texture.sha256)
     if isinstance(source, Folder):
         if reason is not None:
-            raise PipelineError(
-                f"this image cannot be used: {reason}", where=texture.own, remedy="move it out of the folder"
-            )
+            raise unusable(texture, reason)
         texture.load()  # reports a file that is not an image now, not when it is rendered
         return True
     if texture.source == "libero":

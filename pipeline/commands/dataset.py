@@ -31,11 +31,12 @@ dataset = LazyGroup(
 @click.command(cls=Command, epilog=example("dataset check configs/starter.yaml"))
 @config_argument
 def check(config: Path) -> int:
-    """Compare all files of a run with their checksums, and read its RLDS datasets as OpenVLA-OFT does.
+    """Compare replays, frames and datasets with their checksums, and read RLDS datasets as OpenVLA-OFT does.
 
-    Damaged files are listed, and faults that would mislead OpenVLA-OFT's training. The last line is JSON. The exit
-    status is 1 if there is such a file or fault. Move a damaged file to another place, and the run generates it again.
-    The stage validate, a part of every run, compares the datasets with each other and with the plan.
+    The plan, the manifest and the JSON reports are only read; cards, pictures and the report are not checked. Damaged
+    files are listed, and faults that would mislead OpenVLA-OFT's training. The last line is JSON. The exit status is 1
+    if there is such a file or fault. Move a damaged file to another place, and the run generates it again. The stage
+    validate, a part of every run, compares the datasets with each other and with the plan.
     """
     from pipeline.clients import oft
     from pipeline.run.layout import STATISTICS

@@ -23,8 +23,9 @@ DEFAULTS = {"name": "preview", "plan": {"episodes": {}}}
 def doctor(config: Path) -> int:
     """Check versions, OpenGL, disk, memory and demonstrations for a run.
 
-    Each check prints a line that begins with ok, warn or fail, and a remedy below it. No file is written. The exit
-    status is 1 if a check fails.
+    Each check prints a line that begins with ok, warn or fail, and a remedy below it. No file of the run is
+    written. If the plan is outdated, a new one is sampled, which may download textures or objects. The exit status is 1
+    if a check fails.
     """
     from pipeline.run.run import Run
     from pipeline.validation import doctor
@@ -192,8 +193,9 @@ def rewrite(bddl_file: Path, out: Path, per_class: int, endpoint: str, model: st
 
     The bank is the YAML file of --out, which plan.axes.language.bank of a configuration then names. An
     OpenAI-compatible endpoint generates rewrites of each class (distraction, common sense, reasoning chain,
-    paraphrase) until the bank has enough of each class. A rewrite must pass the same checks as the shipped bank. A
-    stopped command resumes when it is called again. The key of the endpoint is read from OPENAI_API_KEY.
+    paraphrase) until the bank has enough of each class. A rewrite must pass the same checks as the shipped bank. The
+    bank is written again with each accepted rewrite: only comments at its beginning are kept. A stopped command resumes
+    when it is called again. The key of the endpoint is read from OPENAI_API_KEY.
     """
     from pipeline.rewriting.language_model import LanguageModel
     from pipeline.rewriting.rewrite import extend

@@ -60,7 +60,8 @@ def results(run: Run) -> dict[str, Path]:
 def status(config: Path) -> None:
     """Show the wanted and kept episodes of a run, the stages that would run and the reasons, disk and time.
 
-    The command reads the folder of the run and writes no file.
+    The command changes no file in the folder of the run. If the plan is outdated, it samples a new one without storing
+    it, which may download textures or objects.
     """
     from rich.console import Console
 
@@ -92,8 +93,8 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
 
     The command lists the parts, their sizes and the stages that generate them again, and then asks for permission.
     Other files in the folder of the run stay, and so do demonstrations, configurations and downloads. The command stops
-    if the folder has no mark of a run, or if a folder to delete contains a file that no stage generated or that was
-    edited.
+    if the folder has no mark of a run, or if a folder to delete contains a file that no stage generated. For the cards
+    and the files for fine-tuning, the command also stops if a file was edited.
     """
     from pipeline.run import claim, cleaning
 

@@ -25,7 +25,7 @@ class RldsConfig(FormatOptions):
     Attributes:
         name: First part of the names of the sets, which must contain ``libero`` for OpenVLA-OFT; ``libero_`` and the
             name of the run by default.
-        shards: Number of TFRecord files of all sets together; by default each file has about 400 MB.
+        shards: Approximate number of TFRecord files of all sets together; by default each file has about 400 MB.
         validation: Share of each task's demonstrations in the split ``val`` instead of ``train``, 0 or 0.001 to 0.5; 0
             by default.
     """

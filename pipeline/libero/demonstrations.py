@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, Protocol
 
@@ -155,6 +155,21 @@ class StarterSource:
 
 
 @dataclass(frozen=True)
+class _Remarks:
+    """Demonstrations of a file whose use may differ from their author's expectation.
+
+    Attributes:
+        clipped: demonstration to the number of its actions that are limited to [-1, 1].
+        copies: demonstration to the id of an earlier one with equal content.
+        with_added_objects: demonstrations with added objects.
+    """
+
+    clipped: dict[str, int] = field(default_factory=dict)
+    copies: dict[str, str] = field(default_factory=dict)
+    with_added_objects: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
 class HDF5Source:
     """LIBERO's published demonstrations: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file.
 
@@ -165,7 +180,9 @@ class HDF5Source:
     root: Path
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
-        """Read and check each demonstration, and index the usable ones; equal copies of a demonstration are problems.
+        """Read and check each demonstration, and index the usable ones.
+
+        Notes name copies of an earlier demonstration, and demonstrations with added objects: both are left out.
 
         Raises:
             PipelineError: when a suite has no folder.
@@ -176,10 +193,11 @@ class HDF5Source:
         notes: list[str] = []
         for suite in dict.fromkeys(task.suite for task in wanted):
             problems += self._files_of_no_task(suite)
+        # Episodes are identified by content: two copies would make two rows with one id.
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
             usable = 0
-            clipped: dict[str, int] = {}
+            of_file = _Remarks()
             try:
                 with self._data(task) as data:
                     for key in hdf5.names(data, str(self._path(task))):
@@ -187,22 +205,21 @@ class HDF5Source:
                             break
                         try:
                             entry = DemoEntry.of(self._read(task, key, data))
-                            # Episodes are identified by content: two copies would make two rows with one id.
-                            first = first_with.setdefault(entry.sha256, entry)
-                            if first is not entry:
-                                raise PipelineError(
-                                    f"has the actions, states and model of {first.demo_id}",
-                                    where=f"{self._path(task)} data/{key}",
-                                    remedy="leave it as it is: a run uses the first of two copies",
-                                )
+                        except PipelineError as error:
+                            problems.append(Problem(f"{task}/{key}", error))
+                            continue
+                        first = first_with.setdefault(entry.sha256, entry)
+                        if first is not entry:
+                            of_file.copies[key] = first.demo_id
+                        elif _has_added_objects(entry):
+                            of_file.with_added_objects.append(key)
+                        else:
                             entries.append(entry)
                             usable += 1
                             outside = _outside(data, key, str(self._path(task)))
                             if outside:
-                                clipped[key] = outside
-                        except PipelineError as error:
-                            problems.append(Problem(f"{task}/{key}", error))
-                notes += self._notes(task, clipped)
+                                of_file.clipped[key] = outside
+                notes += self._notes(task, of_file)
             except PipelineError as error:
                 problems.append(Problem(str(task), error))
         return DemoIndex(entries, problems, tuple(notes))
@@ -283,22 +300,29 @@ class HDF5Source:
             reject_other_control(data, f"{path} data")
             yield data
 
-    def _notes(self, task: Task, clipped: Mapping[str, int]) -> Iterator[str]:
-        """Yield notes on content of a task's file that is ignored or changed.
-
-        Args:
-            task: the task of the file.
-            clipped: demonstration to the number of its actions that are limited to [-1, 1].
-        """
+    def _notes(self, task: Task, remarks: _Remarks) -> Iterator[str]:
+        """Yield notes on content of a task's file that is ignored or changed."""
         path = self._path(task)
         with hdf5.opened(path) as file:
             masks = hdf5.masks(file)
             if masks:
                 yield f"{path}: mask/ ({', '.join(masks)}) is ignored: all demonstrations of data/ are used"
+        clipped = remarks.clipped
         if clipped:
             yield (
                 f"{path}: {sum(clipped.values())} actions of {len(clipped)} demonstrations are limited to [-1, 1], as "
                 f"robosuite does when it executes them (first: {next(iter(clipped))})"
+            )
+        if remarks.copies:
+            copy, original = next(iter(remarks.copies.items()))
+            yield (
+                f"{path}: {len(remarks.copies)} demonstrations are left out, as copies in actions, states and model "
+                f"(first: data/{copy}, of {original})"
+            )
+        if remarks.with_added_objects:
+            yield (
+                f"{path}: {len(remarks.with_added_objects)} demonstrations are left out, because they are episodes of "
+                f"the axis layout, whose objects no new label would state (first: {remarks.with_added_objects[0]})"
             )
 
     def _read(self, task: Task, key: str, data: h5py.Group) -> Demo:
@@ -330,7 +354,29 @@ class HDF5Source:
         if origin == HUMAN:
             return demo
         changes = hdf5.text(group, "perturbations", where)
+        _axes_of(changes, where)  # reports a damaged list
         return replace(demo, perturbations=changes, expanded_from_sha256=hdf5.origin_sha256(group))
+
+
+def _has_added_objects(entry: DemoEntry) -> bool:
+    """Return whether a demonstration is an exported episode of the axis ``layout``."""
+    return "layout" in _axes_of(entry.perturbations, entry.demo_id)
+
+
+def _axes_of(perturbations: str, where: str) -> list[str]:
+    """List the axes of recorded perturbations.
+
+    Raises:
+        PipelineError: if the text is no JSON list of perturbations.
+    """
+    try:
+        return [str(perturbation["axis"]) for perturbation in json.loads(perturbations)]
+    except (ValueError, TypeError, LookupError) as error:
+        raise PipelineError(
+            f"the attribute 'perturbations' is no list of perturbations ({error})",
+            where=where,
+            remedy="use the file as it was exported or expanded",
+        ) from error
 
 
 class _Recorded(NamedTuple):

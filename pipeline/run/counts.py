@@ -124,7 +124,7 @@ def shortfalls(found: Mapping[str, Target]) -> list[str]:
         if target.planned < target.wanted:
             remedy = f"only {target.planned} could be planned: use more demonstrations or wider ranges"
         else:
-            remedy = "raise plan.reserve, which adds candidates and keeps all finished work"
+            remedy = "raise plan.reserve, which adds candidates; more similar ones may replace some kept episodes"
         sentences.append(f"{axis}: {target.kept} of {target.wanted} wanted episodes are kept; {remedy}")
     return sentences
 

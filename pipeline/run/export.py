@@ -54,6 +54,12 @@ FINISHED = "record.json"
 BEFORE = "before"
 """Folder of a format's work folder: the replaced dataset, until the new one has its record."""
 
+CHANGED = "changed"
+"""Folder of a format's work folder: the record of a dataset with missing or changed files, until it is replaced.
+
+The record shows which other files in the dataset's folder are the user's.
+"""
+
 
 def export_run(kind: type[AnyFormat], run: Run) -> None:
     """Bring a run's dataset of one format up to date, and print the result.
@@ -92,7 +98,7 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
             file that its record does not list.
     """
     sets = target.sets(target.pieces(episodes)) if episodes.ids else set()
-    # Records in the work folder are of killed calls.
+    # Records in the work folder are of killed calls, and of datasets with missing or changed files.
     records = [Export.from_json(read_json(file)) for file in target.work.glob(f"*/{FINISHED}")]
     with suppress(PipelineError):  # The dataset has no record, or has changed since.
         records.append(target.record())
@@ -121,10 +127,10 @@ def refuse_unrecorded(folder: Path) -> None:
         PipelineError: naming such a file, or the record if it is damaged.
     """
     record_file = folder.with_name(f"{folder.name}.json")
-    # Records in the work folder are of killed calls.
-    of_killed_calls = (folder.parent / WORK / folder.name).glob(f"*/{FINISHED}")
+    # Records in the work folder are of killed calls, and of datasets with missing or changed files.
+    further_records = (folder.parent / WORK / folder.name).glob(f"*/{FINISHED}")
     recorded: set[str] = set()
-    for file in (record_file, *of_killed_calls):
+    for file in (record_file, *further_records):
         if file.is_file():
             content = read_json(file, "restore the file, or move the folder of the dataset elsewhere")
             recorded |= content.get("files", {}).keys()
@@ -289,17 +295,24 @@ def unlist_lost_records(run: Run) -> None:
 
 
 def notice_changes(target: AnyFormat) -> None:
-    """Delete the record of a finished dataset whose files are missing or changed, so that it counts as missing."""
+    """Put the record of a finished dataset whose files are missing or changed away, so that it counts as missing."""
     if not target.record_file.exists() or untouched(target):
         return
     try:
-        same = all(checksum(target.folder / name) == sha256 for name, sha256 in target.record().files.items())
-    except (PipelineError, OSError):
+        record = target.record()
+    except PipelineError:
+        target.record_file.unlink()
+        return
+    try:
+        same = all(checksum(target.folder / name) == sha256 for name, sha256 in record.files.items())
+    except OSError:
         same = False
     if same:  # A copy has other times.
         target.record_file.touch()
-    else:
-        target.record_file.unlink()
+        return
+    changed = target.work / CHANGED
+    changed.mkdir(parents=True, exist_ok=True)
+    os.replace(target.record_file, changed / FINISHED)
 
 
 def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
@@ -317,7 +330,7 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     """
     pieces, basis = target.pieces(episodes), compute_basis(target, episodes)
     work = target.work / basis.identity
-    keep_below(target.work, {work})
+    keep_below(target.work, {work, target.work / CHANGED / FINISHED})
     finished = work / FINISHED
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, workers)

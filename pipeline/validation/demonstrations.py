@@ -130,7 +130,9 @@ class _FileJob:
         faults = [str(problem.error) for problem in index.problems if f"{problem.name}/".startswith(f"{self.task}/")]
         if not index.entries and not faults:
             expected = "groups data/demo_<number>"
-            faults.append(str(PipelineError("the file has no demonstration", where=self._file, expected=expected)))
+            faults.append(
+                str(PipelineError("the file has no usable demonstration", where=self._file, expected=expected))
+            )
         chosen = self._chosen(index.entries)
         reasons = self._replayed(chosen, self.replay)
         missing = [entry for entry, reason in reasons.items() if reason in MISSED]

@@ -133,6 +133,16 @@ def test_no_recorded_brightness_is_lost_in_shadows() -> None:
     assert all(shown[low] < shown[high] for low, high in pairwise(scales))
 
 
+def test_without_an_interval_below_1_brightness_is_never_raised_where_lamps_are_at_their_limit() -> None:
+    ranges = [range_.model_copy(update={"brightness_scale": ((1.2, 1.5),)}) for range_ in LightAxis().ranges]
+    axis = LightAxis.model_validate({"ranges": ranges, "components": ["combined"]})
+    lights = [axis.sample(rng("key", key), MILK, 0) for key in range(100)]
+    of_shadows = [light.diffuse_scale_rgb for light in lights if light.shadows]
+    assert len(of_shadows) > 30
+    assert all(max(scale) == 1.0 > min(scale) for scale in of_shadows), "tinted"
+    assert any(min(light.diffuse_scale_rgb) >= 1.2 for light in lights if not light.shadows)
+
+
 @pytest.mark.parametrize(("directional", "left"), [("false", 0.8), ("true", 0.4)])
 def test_a_third_lamp_dims_the_others_where_it_lights_the_whole_room(directional: str, left: float) -> None:
     """Spot lamps light a part each, and at 0.8 stay; a directional one adds its 0.8 to that of each: 1.6, of which half

@@ -150,8 +150,7 @@ def test_a_folder_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         find(texture.name, texture.sha256)
 
 
-def test_two_images_of_one_name_are_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_two_images_of_one_name_are_two(tmp_path: Path) -> None:
     folders = [Folder(folder=tmp_path / name, licence="CC0") for name in ("one", "other")]
     for shade, source in enumerate(folders):
         source.folder.mkdir()
@@ -159,20 +158,33 @@ def test_two_images_of_one_name_are_two(tmp_path: Path, monkeypatch: pytest.Monk
     assert sorted(texture.load().max() for texture in catalogue(tuple(folders)).values()) == [0, 1]
 
 
-@pytest.mark.parametrize("fault", ["copy of a test image", "normal map", "not an image", "empty", "missing"])
-def test_a_folder_with_a_fault_is_an_error_that_names_it(tmp_path: Path, fault: str) -> None:
+FAULTS = {
+    "copy of a test image": "its bytes are those of an image that test tasks show",
+    "surface of a test task": "it has the name of an image that test tasks show",
+    "normal map": "its name is that of a data map",
+    "not an image": "the file is not a readable image",
+    "empty": "the folder has no images",
+    "missing": "the folder has no images",
+}
+
+
+@pytest.mark.parametrize(("fault", "message"), FAULTS.items())
+def test_a_folder_with_a_fault_is_an_error_that_names_it(tmp_path: Path, fault: str, message: str) -> None:
     folder = tmp_path / fault
     if fault != "missing":
         folder.mkdir()
     match fault:
         case "copy of a test image":
             shutil.copy(LIBERO / "stucco_wall.png", folder / "mine.png")
+        case "surface of a test task":
+            cv2.imwrite(str(folder / "bricks02-col-var1-6k.jpg"), np.zeros((8, 8, 3), np.uint8))
         case "normal map":
             cv2.imwrite(str(folder / "wood_NRM_2K.png"), np.zeros((8, 8, 3), np.uint8))
         case "not an image":
             (folder / "mine.png").write_bytes(b"no image")
-    with pytest.raises(PipelineError, match=fault):
-        catalogue((Folder(folder=folder, licence="CC0"),))
+    axis = BackgroundAxis(sources=(Folder(folder=folder, licence="CC0"),))
+    with pytest.raises(PipelineError, match=f"{message}(?s:.*){fault}|{fault}(?s:.*){message}"):
+        axis.offered()
 
 
 def test_a_wheel_s_images_are_offered_once_and_only_surfaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """Demonstrations are read as recorded, known by what is in them, and written in LIBERO's own layout."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -118,11 +119,36 @@ def test_an_exact_copy_is_left_out_and_both_are_named(root: Path, model_file: st
     index = HDF5Source(root).index([TASK, other])
     assert [entry.key for entry in index.entries if entry.task == TASK] == [f"demo_{n}" for n in range(11) if n != 2]
     assert [entry.key for entry in index.entries if entry.task == other] == ["demo_1"]
-    assert [problem.name for problem in index.problems] == [f"{NAME}/demo_2", f"{other.suite}/{other.name}/demo_0"]
-    for problem in index.problems:
-        assert f"has the actions, states and model of {NAME}/demo_1" in str(problem.error)
-        assert f"data/{problem.name.rpartition('/')[2]}" in str(problem.error)
+    assert not index.problems
+    for note, copy in zip(index.notes, ("demo_2", "demo_0"), strict=True):
+        assert f"1 demonstrations are left out, as copies in actions, states and model (first: data/{copy}" in note
+        assert f"of {NAME}/demo_1" in note
     assert len(HDF5Source(root).index([TASK], per_task=3).entries) == 3
+
+
+@pytest.mark.parametrize(("axis", "used"), [("layout", 10), ("robot", 11)])
+def test_exported_episodes_with_added_objects_are_left_out(root: Path, axis: str, used: int) -> None:
+    with h5py.File(file_in(root), "r+") as file:
+        attributes = file["data/demo_3"].attrs
+        attributes["expanded_from"] = f"{NAME}/demo_0"
+        attributes["origin_sha256"] = "0" * 64
+        attributes["perturbations"] = json.dumps([{"axis": "noise"}, {"axis": axis}])
+    index = HDF5Source(root).index([TASK])
+    assert (len(index.entries), index.problems) == (used, [])
+    assert [note for note in index.notes if "episodes of the axis layout" in note] == list(index.notes)
+    assert len(index.notes) == 11 - used
+
+
+@pytest.mark.parametrize("damaged", ["", "{}x", "5", '["layout"]'])
+def test_a_damaged_list_of_perturbations_is_named(root: Path, damaged: str) -> None:
+    with h5py.File(file_in(root), "r+") as file:
+        attributes = file["data/demo_3"].attrs
+        attributes["expanded_from"] = f"{NAME}/demo_0"
+        attributes["origin_sha256"] = "0" * 64
+        attributes["perturbations"] = damaged
+    (problem,) = HDF5Source(root).index([TASK]).problems
+    assert "'perturbations' is no list of perturbations" in str(problem.error)
+    assert "data/demo_3" in str(problem.error)
 
 
 def test_earlier_names_of_a_task_are_accepted(root: Path) -> None:

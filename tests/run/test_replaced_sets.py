@@ -14,6 +14,7 @@ import pytest
 from synthetic import episodes, files
 
 from pipeline.config import Config
+from pipeline.errors import PipelineError
 from pipeline.formats.base import Format
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
@@ -39,6 +40,27 @@ def command(name: str, data: Path) -> None:
     """What a run does with one format: the stage ``inputs``, then that of the export."""
     notice_changes(target(name, data, "new"))
     _bring_up_to_date(target(name, data, "new"), episodes(), RUN)
+
+
+@pytest.mark.parametrize("name", ["rlds", "lerobot"])
+@pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_bytes(b"rot")], ids=["missing", "changed"])
+def test_a_file_of_the_user_stays_where_a_damaged_dataset_is_generated_again(
+    name: str, damage: Callable[[Path], object], tmp_path: Path
+) -> None:
+    command(name, tmp_path)
+    expected = files(tmp_path)
+    folder = target(name, tmp_path, "new").folder
+    damaged = max(folder.rglob("*.*"), key=lambda file: file.stat().st_size if file.is_file() else 0)
+    note = damaged.with_name("note.csv")
+    note.write_text("of the user")
+    damage(damaged)
+    for _ in range(2):
+        with pytest.raises(PipelineError, match=r"note\.csv"):
+            command(name, tmp_path)
+    assert note.read_text() == "of the user"
+    note.unlink()
+    command(name, tmp_path)
+    assert files(tmp_path) == expected
 
 
 def in_a_fork(action: Callable[[], None]) -> int:

@@ -157,7 +157,7 @@ class LeRobot(Format[LeRobotConfig]):
         """
         slices: dict[str, tuple[str, Sequence[str]]] = {}
         for split_name, members in episodes.by_split(self.options.validation).items():
-            share = round((self.options.shards or 0) * len(members) / len(episodes.known))
+            share = ceil((self.options.shards or 0) * len(members) / len(episodes.known))
             steps = sum(episodes.known[episode_id].steps for episode_id in members)
             least = ceil(steps / self._steps_of_a_file())
             for ids in split(members, max(1, share, least)):
