@@ -44,6 +44,8 @@ EXPORTS = {
 
 MANIFEST = "manifest.parquet of this run"
 
+HEAD = "# In the commands, $DATA is the absolute path of the run's folder, which has this file's folder.\n"
+
 
 def sourced(value: Any, source: str) -> dict[str, Any]:
     """Return a field of the recipe."""
@@ -174,7 +176,7 @@ def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, dataset
     with generated(folder) as unfinished:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
-        (unfinished / RECIPE).write_text(text)
+        (unfinished / RECIPE).write_text(HEAD + text)
         if export.options_for(Rlds) is not None:
             shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
         if lerobot is not None and lerobot.validation:

@@ -358,6 +358,7 @@ class Checkpoint:
         if config.device is None or (config.device.startswith("cuda") and not torch.cuda.is_available()):
             config.device = "cpu"
         self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        _refuse_other_weights(self._policy.state_dict(), folder)
         self._policy.eval()
         self._before, self._after = make_pre_post_processors(
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
@@ -392,6 +393,41 @@ class Checkpoint:
 
     def end(self, success: bool) -> None:
         """End the episode, without effect on the policy."""
+
+
+COMPARED_TENSORS = 20
+"""Number of a checkpoint's tensors that are compared with those of the loaded policy."""
+
+
+def _refuse_other_weights(loaded: Mapping[str, Any], folder: Path) -> None:
+    """Compare some tensors of the loaded policy, evenly chosen by name, with those of the checkpoint.
+
+    lerobot's pi0.5 prints a line and keeps random weights if it fails to load them (huggingface/lerobot#4577).
+
+    Raises:
+        PipelineError: if no tensor of the checkpoint is in the policy, or one differs.
+    """
+    from safetensors import safe_open
+
+    file = folder / "model.safetensors"
+    if not file.is_file():  # Adapters and other forms of weights.
+        return
+    with safe_open(file, "pt") as weights:
+        names = sorted(loaded.keys() & {*weights.keys()})
+        chosen = names[:: max(1, len(names) // COMPARED_TENSORS)]
+        differing = [name for name in chosen if not _is_loaded(loaded[name], weights.get_tensor(name))]
+    if not chosen or differing:
+        raise PipelineError(
+            f"lerobot did not load the weights ({differing[0] if chosen else 'no name in common'})",
+            where=file,
+            expected="a policy with the tensors of the checkpoint",
+            remedy="evaluate with the version of lerobot that trained it, and read its output",
+        )
+
+
+def _is_loaded(tensor: Any, stored: Any) -> bool:
+    """Return whether a policy's tensor has the stored values, in its own type."""
+    return bool(tensor.shape == stored.shape and (tensor.cpu() == stored.to(tensor.dtype)).all())
 
 
 BESIDE = ("train_config.json", "README.md")

@@ -14,6 +14,7 @@ from anyio.from_thread import start_blocking_portal
 from conftest import REPOSITORY, STOVE
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from server_process import running
@@ -117,6 +118,17 @@ def test_a_checkpoint_that_needs_another_image_is_refused(tmp_path: Path) -> Non
     with pytest.raises(PipelineError, match=r"needs the images .*front, which") as found:
         cameras_of(act, {}, tmp_path)
     assert "--rename_map" in str(found.value)
+
+
+def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """lerobot 0.6.1's pi0.5 keeps random weights after a failure, as this stand-in does."""
+    folder = checkpoints.save(tmp_path, 0.25)
+    Checkpoint(folder)
+    monkeypatch.setattr(ACTPolicy, "from_pretrained", classmethod(lambda kind, _, config: kind(config)))
+    with pytest.raises(PipelineError, match=r"did not load the weights \(model\..*model\.safetensors"):
+        Checkpoint(folder)
 
 
 def test_a_checkpoint_of_renamed_images_acts_like_one_of_ours(tmp_path: Path) -> None:
