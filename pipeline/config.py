@@ -378,6 +378,14 @@ class Config(Frozen):
         return self
 
     @model_validator(mode="after")
+    def _rewrites_are_sampled_by_a_client(self) -> Config:
+        if self.finetune.rewrite_probability and "rlds" not in self.export.formats:
+            raise ValueError(
+                "finetune.rewrite_probability requires export.rlds, as only the script for OpenVLA-OFT samples rewrites"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _export_selects_from_the_run(self) -> Config:
         components = {CLEAN}
         for axis in self.plan.axes.configured():

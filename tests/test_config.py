@@ -13,7 +13,7 @@ import jsonschema
 import pytest
 import yaml
 from conftest import REPOSITORY
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.language import LanguageAxis
@@ -287,6 +287,13 @@ def test_axes_refuse_a_replay_that_cannot_perform_them(axis: str, replay: str, m
     file.write_text(f"{{name: run, plan: {{episodes: {{{axis}: 1}}}}, replay: {{{replay}}}}}")
     with pytest.raises(PipelineError, match=message):
         load(file)
+
+
+def test_sampled_rewrites_need_the_format_whose_client_samples_them() -> None:
+    run = {"name": "run", "plan": {"episodes": {"noise": 1}}, "finetune": {"rewrite_probability": 0.5}}
+    assert Config.model_validate(run).finetune.rewrite_probability == 0.5
+    with pytest.raises(ValidationError, match=r"rewrite_probability requires export\.rlds"):
+        Config.model_validate(run | {"export": {"rlds": None}})
 
 
 def test_the_examples_of_the_documentation_are_valid() -> None:

@@ -127,7 +127,7 @@ def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_refused(
     folder = checkpoints.save(tmp_path, 0.25)
     Checkpoint(folder)
     monkeypatch.setattr(ACTPolicy, "from_pretrained", classmethod(lambda kind, _, config: kind(config)))
-    with pytest.raises(PipelineError, match=r"did not load the weights \(model\..*model\.safetensors"):
+    with pytest.raises(PipelineError, match=r"model\.safetensors: lerobot did not load the weights \(model\."):
         Checkpoint(folder)
 
 
