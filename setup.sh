@@ -97,10 +97,17 @@ install_packages() {
 }
 
 install_venv() {
-    local index
+    local index aside
     if [[ $PYTHON != .venv/bin/python ]]; then
+        # An environment without this script's mark is the user's.
+        if [[ -e .venv && ! -e .venv/of_setup ]]; then
+            aside=.venv.$(date +%Y%m%d%H%M%S)
+            mv .venv "$aside"
+            echo "setup.sh: moved .venv to $aside, because this script did not create it"
+        fi
         rm -rf .venv
         "$PYTHON" -m venv .venv || stopped "$PYTHON could not create .venv"
+        touch .venv/of_setup
     fi
     .venv/bin/pip install --quiet "uv==$UV_VERSION" || stopped "pip could not install uv"
     # uv does not read pip's configuration: pass it the mirror of this configuration.

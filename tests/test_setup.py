@@ -128,6 +128,20 @@ def test_an_installation_that_failed_is_tried_again(tree: Tree) -> None:
     assert "uv pip sync --compile-bytecode --require-hashes requirements.lock" in tree.calls()
 
 
+def test_an_environment_of_the_user_is_moved_aside(tree: Tree) -> None:
+    (tree.root / ".venv").mkdir()
+    (tree.root / ".venv" / "mine").touch()
+    done = tree.setup()
+    assert done.returncode == 0, done.stderr
+    (aside,) = tree.root.glob(".venv.*")
+    assert (aside / "mine").exists()
+    assert f"moved .venv to {aside.name}" in done.stdout
+    # An unfinished environment of the script itself is replaced.
+    (tree.root / ".venv" / "installed").unlink()
+    assert tree.setup().returncode == 0
+    assert [*tree.root.glob(".venv.*")] == [aside]
+
+
 def test_a_tool_that_stops_is_named_with_what_to_try(tree: Tree) -> None:
     assert tree.setup().returncode == 0
     (tree.root / ".venv" / "bin" / "uv").write_text("#!/bin/bash\necho no host >&2; exit 1\n")

@@ -79,9 +79,11 @@ class Export(Record):
 
     Attributes:
         places: episode id to the format's columns of the manifest.
+        sizes: path of each file to its size in bytes; empty in records of earlier versions.
     """
 
     places: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    sizes: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Export":
@@ -91,7 +93,7 @@ class Export(Record):
             LookupError, TypeError, ValueError: when the content is not such a record.
         """
         basis = Basis(content["identity"], content.get("asked", ""), content.get("made_with", {}))
-        return cls(basis, dict(content["files"]), content["places"])
+        return cls(basis, dict(content["files"]), content["places"], content.get("sizes", {}))
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of the file."""
@@ -101,6 +103,7 @@ class Export(Record):
             "places": self.places,
             "asked": self.basis.requested,
             "made_with": self.basis.made_with,
+            "sizes": self.sizes,
         }
 
 

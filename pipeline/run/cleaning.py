@@ -56,7 +56,7 @@ def _datasets(group: str) -> Part:
 
 
 PARTS = {
-    "unfinished": Part((WORK,), "no stage (unfinished files of stopped stages)"),
+    "unfinished": Part((WORK, f"{FAILURES}/{WORK}"), "no stage (unfinished files of stopped stages)"),
     "pictures": Part((SHEETS, PREVIEWS, REPORT), "summary and report"),
     "uploads": Part((CARD, FINETUNE), "card and recipe"),
     **{group: _datasets(group) for group in GROUPS},

@@ -34,7 +34,7 @@ from pipeline.files import (
 )
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
-from pipeline.identity import refuse_unasked
+from pipeline.identity import ALLOW, REMAKE, refuse_unasked
 from pipeline.record import Basis
 from pipeline.run.layout import DATASETS, WORK
 from pipeline.run.outcome import shuffled
@@ -76,6 +76,7 @@ def export_run(kind: type[AnyFormat], run: Run) -> None:
 
 def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     refuse_foreign(target, episodes)
+    refuse_changed(target)
     if not episodes.ids and "outcome" in target.content.extras:
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
@@ -98,23 +99,59 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
             file that its record does not list.
     """
     sets = target.sets(target.pieces(episodes)) if episodes.ids else set()
-    # Records in the work folder are of killed calls, and of datasets with missing or changed files.
-    records = [Export.from_json(read_json(file)) for file in target.work.glob(f"*/{FINISHED}")]
-    with suppress(PipelineError):  # The dataset has no record, or has changed since.
-        records.append(target.record())
-    recorded: set[str] = set()
-    for record in records:
-        recorded |= record.files.keys()
+    recorded = _recorded(target)
     sets |= {name.partition("/")[0] for name in recorded}
     foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in sets)
-    if records and not foreign:
+    if recorded and not foreign:
         foreign = _unrecorded(target.folder, recorded)
     if foreign:
+        raise _foreign(target, foreign, sets)
+
+
+def _recorded(target: AnyFormat) -> set[str]:
+    """Return the paths of a dataset's files in all records: empty if there is none.
+
+    Records in the work folder are of killed calls, and of datasets with missing or changed files.
+    """
+    recorded: set[str] = set()
+    for file in target.work.glob(f"*/{FINISHED}"):
+        recorded |= Export.from_json(read_json(file)).files.keys()
+    with suppress(PipelineError):  # The dataset has no record, or has changed since.
+        recorded |= target.record().files.keys()
+    return recorded
+
+
+def _foreign(target: AnyFormat, foreign: Sequence[Path], sets: Collection[str]) -> PipelineError:
+    """Return the error about entries of a dataset's folder that no export wrote."""
+    return PipelineError(
+        f"the entry is not of this run's {target.title} and would be deleted ({len(foreign)} such entries)",
+        where=foreign[0],
+        expected=f"only {', '.join(sorted(sets))}",
+        remedy=f"move it out of {target.folder}; to train on both, create a folder of links to both",
+    )
+
+
+def refuse_changed(target: AnyFormat) -> None:
+    """Stop before a changed file of a finished dataset is replaced; a missing file is generated again.
+
+    Raises:
+        PipelineError: naming the file, unless ``REMAKE=1`` allows it.
+    """
+    record_file = target.work / CHANGED / FINISHED
+    if not record_file.is_file():
+        return
+    recorded = Export.from_json(read_json(record_file)).files
+    changed: list[Path] = []
+    for name, sha256 in recorded.items():
+        file = target.folder / name
+        if file.is_file() and checksum(file) != sha256:
+            changed.append(file)
+    if changed and os.environ.get(REMAKE) != "1":
         raise PipelineError(
-            f"the entry is not of this run's {target.title} and would be deleted ({len(foreign)} such entries)",
-            where=foreign[0],
-            expected=f"only {', '.join(sorted(sets))}",
-            remedy=f"move it out of {target.folder}; to train on both, create a folder of links to both",
+            f"the file was edited or damaged, and would be replaced ({len(changed)} such files)",
+            where=changed[0],
+            expected=f"the content that {record_file} lists",
+            remedy=f"move it to another place, and it is generated again; or allow the change: {ALLOW}",
         )
 
 
@@ -267,16 +304,17 @@ def changed_file(target: AnyFormat) -> Path | None:
     """
     try:
         recorded = target.record_file.stat().st_mtime_ns
-        names = target.record().files
+        record = target.record()
     except (PipelineError, OSError):
         return target.record_file
-    for name in names:
+    for name in record.files:
         file = target.folder / name
         try:
-            unchanged = file.stat().st_mtime_ns <= recorded
+            found = file.stat()
         except OSError:
-            unchanged = False
-        if not unchanged:
+            return file
+        # A file that was copied over another one may have an earlier time.
+        if found.st_mtime_ns > recorded or found.st_size != record.sizes.get(name, found.st_size):
             return file
     return None
 
@@ -295,7 +333,13 @@ def unlist_lost_records(run: Run) -> None:
 
 
 def notice_changes(target: AnyFormat) -> None:
-    """Put the record of a finished dataset whose files are missing or changed away, so that it counts as missing."""
+    """Put the record of a finished dataset whose files are missing or changed away, so that it counts as missing.
+
+    The record returns if all files have their content again.
+    """
+    put_away = target.work / CHANGED / FINISHED
+    if not target.record_file.exists() and put_away.is_file():
+        os.replace(put_away, target.record_file)
     if not target.record_file.exists() or untouched(target):
         return
     try:
@@ -310,9 +354,8 @@ def notice_changes(target: AnyFormat) -> None:
     if same:  # A copy has other times.
         target.record_file.touch()
         return
-    changed = target.work / CHANGED
-    changed.mkdir(parents=True, exist_ok=True)
-    os.replace(target.record_file, changed / FINISHED)
+    put_away.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(target.record_file, put_away)
 
 
 def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
@@ -342,7 +385,8 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         checksums = workers(checksum, paths, f"{target.title} checksums")
         files = {path.relative_to(dataset).as_posix(): sha256 for path, sha256 in zip(paths, checksums, strict=True)}
         with replaced(finished) as temporary:
-            record = Export(basis, files, places)
+            sizes = {path.relative_to(dataset).as_posix(): path.stat().st_size for path in paths}
+            record = Export(basis, files, places, sizes)
             temporary.write_text(json.dumps(record.to_json(), indent=0) + "\n")
     _replace(target, work)
 
@@ -356,6 +400,11 @@ def _replace(target: AnyFormat, work: Path) -> None:
         work: folder with the record, and with the folder ``dataset`` unless a killed call moved it.
     """
     if (work / "dataset").is_dir():
+        # The user may have stored files since the export began.
+        recorded = _recorded(target)
+        foreign = _unrecorded(target.folder, recorded)
+        if foreign:
+            raise _foreign(target, foreign, {name.partition("/")[0] for name in recorded})
         if target.folder.exists():
             os.replace(target.folder, target.work / BEFORE)
         target.record_file.unlink(missing_ok=True)  # This record is of the earlier dataset.

@@ -57,6 +57,8 @@ def foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> Iterat
     """Yield the files and links in ``folders`` of a run's folder that no stage generated."""
     for name in CLEARED.keys() & {*folders}:
         pattern, folder = re.compile(CLEARED[name]), data / name
+        if folder.is_file():
+            yield folder
         for entry in _entries(folder):
             path = entry.path[len(str(folder)) + 1 :]
             temporary = any(is_temporary(part) for part in path.split(os.sep))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic import episodes, files
+from synthetic import episode, episodes, files
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
@@ -20,6 +20,7 @@ from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobot
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import _bring_up_to_date, notice_changes
 from pipeline.run.run import Run
+from pipeline.types import Episode
 
 PLAN = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
 RUN = Run(Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}}))
@@ -59,8 +60,70 @@ def test_a_file_of_the_user_stays_where_a_damaged_dataset_is_generated_again(
             command(name, tmp_path)
     assert note.read_text() == "of the user"
     note.unlink()
+    damaged.unlink(missing_ok=True)
     command(name, tmp_path)
     assert files(tmp_path) == expected
+
+
+@pytest.mark.parametrize("edit", [b"rot", b"0" * 100_000], ids=["shorter", "longer"])
+def test_an_edited_file_is_replaced_only_where_that_is_allowed(
+    edit: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command("rlds", tmp_path)
+    expected = files(tmp_path)
+    edited = next(tmp_path.rglob("dataset_info.json"))
+    before = edited.stat()
+    edited.write_bytes(edit)
+    # As by `cp -p` or `rsync -a` from a copy.
+    os.utime(edited, ns=(before.st_atime_ns, before.st_mtime_ns))
+    for _ in range(2):
+        with pytest.raises(PipelineError, match=r"dataset_info\.json: the file was edited or damaged"):
+            command("rlds", tmp_path)
+    assert edited.read_bytes() == edit
+    edited.write_bytes(expected[str(edited.relative_to(tmp_path))])
+    command("rlds", tmp_path)
+    assert files(tmp_path) == expected, "its record returned"
+    edited.write_bytes(edit)
+    monkeypatch.setenv("REMAKE", "1")
+    command("rlds", tmp_path)
+    assert files(tmp_path) == expected
+
+
+@pytest.mark.parametrize("lost", ["truncated", "deleted"])
+def test_a_file_of_the_user_stays_where_the_record_is_lost(lost: str, tmp_path: Path) -> None:
+    command("rlds", tmp_path)
+    expected = files(tmp_path)
+    note = next(tmp_path.rglob("dataset_info.json")).with_name("note.csv")
+    note.write_text("of the user")
+    record = target("rlds", tmp_path, "new").record_file
+    if lost == "truncated":
+        record.write_bytes(record.read_bytes()[:99])
+    else:
+        record.unlink()
+    with pytest.raises(PipelineError, match=r"note\.csv"):
+        command("rlds", tmp_path)
+    assert note.read_text() == "of the user"
+    note.unlink()
+    command("rlds", tmp_path)
+    assert files(tmp_path) == expected
+
+
+def test_a_file_that_the_user_stores_during_an_export_stays(tmp_path: Path) -> None:
+    command("rlds", tmp_path)
+    note = next(tmp_path.rglob("dataset_info.json")).with_name("note.csv")
+
+    def load(episode_id: str) -> Episode:
+        note.write_text("of the user")
+        return episode(episode_id)
+
+    export_target = target("rlds", tmp_path, "new")
+    with pytest.raises(PipelineError, match=r"note\.csv"):
+        _bring_up_to_date(export_target, episodes(load, content="second"), RUN)
+    assert note.read_text() == "of the user"
+    note.unlink()
+    _bring_up_to_date(export_target, episodes(content="second"), RUN)
+    assert not note.exists()
+    assert not export_target.work.exists()
 
 
 def in_a_fork(action: Callable[[], None]) -> int:
