@@ -13,7 +13,7 @@ import json
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -163,13 +163,19 @@ class Store(ABC):
         return valid, {*listed, *names} - valid.keys()
 
     def rows_of_all_settings(self) -> dict[str, dict[str, Any]]:
-        """Map the name of each file that ``rows`` or the table lists to its row, also for files with other settings.
+        """Map the name of each file to its row, also for files of other settings or versions.
 
         Raises:
             PipelineError: as ``rows``.
         """
-        listed, _ = self._table()
-        return {name: row for name, row in listed.items() if self.path(name).exists()} | self.rows()
+        valid, invalid_names = self._believed()
+        rows = dict(valid)
+        for name in sorted(invalid_names):
+            if self.path(name).exists():
+                # A file of an earlier version may lack attributes; `outdated` counts it.
+                with self._readable(name) as file, suppress(LookupError):
+                    rows[name] = self._row_of(name, file)
+        return rows
 
     def settings_by_fingerprint(self) -> dict[str, object]:
         """Map each fingerprint of the table's metadata to the settings that its files were written with."""
@@ -185,10 +191,11 @@ class Store(ABC):
         if not self.path(name).exists():
             return None
         with self._readable(name) as file:
-            if file.attributes["made_by"] != self.made_by:
-                return None
-            described = self.describe(file)
-        return {"file": name, "made_by": self.made_by, "bytes": self.path(name).stat().st_size, **described}
+            return self._row_of(name, file) if file.attributes["made_by"] == self.made_by else None
+
+    def _row_of(self, name: str, file: SealedFile) -> dict[str, Any]:
+        size = self.path(name).stat().st_size
+        return {"file": name, "made_by": file.attributes["made_by"], "bytes": size, **self.describe(file)}
 
     def _table(self) -> tuple[dict[str, dict[str, Any]], int]:
         """Read the table's rows and the time when it was written, in ns; no rows if it is missing or damaged."""
@@ -220,11 +227,15 @@ class Store(ABC):
             self.refresh()
 
     def refresh(self) -> dict[str, dict[str, Any]]:
-        """Return ``rows`` and write them as the table; only for the stage that generates the files."""
+        """Return ``rows`` and write them as the table; only for the stage that generates the files.
+
+        Unchanged files of other fingerprints stay listed until ``keep``, so that ``run/dropped.py`` can measure them.
+        """
         rows, table_up_to_date = self._rows()
         records = self._records()
         if not table_up_to_date or self.made_by not in records:
-            self._write(rows, records | {self.made_by: Record(self.basis)})
+            listed, _ = self._believed()
+            self._write(listed | rows, records | {self.made_by: Record(self.basis)})
         return rows
 
     def keep(self, names: Iterable[str]) -> None:

@@ -2,21 +2,24 @@
 
 import hashlib
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from conftest import run_stages
 
 from pipeline import status
-from pipeline.config import load
+from pipeline.config import Config, load
 from pipeline.identity import REMAKE
 from pipeline.run import cleaning, dropped, machine, plan_stage
 from pipeline.run.run import Run
 from pipeline.run.work_time import REFERENCE
 from pipeline.stores.frame_store import FrameStore
+from pipeline.types import Jpeg, Rendered
 from pipeline.validation import doctor
 
 Change = Callable[[dict[str, Any]], None]
@@ -84,6 +87,45 @@ def test_a_run_stops_before_it_deletes_and_status_and_doctor_say_the_same(
     assert amount in finding.detail
     monkeypatch.setenv(REMAKE, "1")
     assert "later stages delete finished work that is no longer needed" in run_stages(clone, fields, stages)
+
+
+def run_of_quality(folder: Path, jpeg_quality: int) -> Run:
+    content = {
+        "name": "tiny",
+        "folder": str(folder),
+        "demos": {"tasks": ["libero_goal/turn_on_the_stove"]},
+        "plan": {"episodes": {"camera": 1}},
+        "render": {"jpeg_quality": jpeg_quality},
+    }
+    return Run(Config.model_validate(content))
+
+
+@pytest.mark.parametrize("change", ["killed before its second table", "finished", "one file touched", "one file lost"])
+def test_frames_of_another_quality_count_whatever_the_table_lists(change: str, tmp_path: Path) -> None:
+    frames = run_of_quality(tmp_path, 95).frames
+    frames.root.mkdir(parents=True)
+    frames.refresh()
+    none = np.zeros((100, 8), np.float32)
+    for number in range(10):
+        rendered = Rendered("open_loop", none, none[:, :7], none[:, :7], none, streams={"a" * 16: [Jpeg(b"x")] * 100})
+        frames.save(f"{number:016x}", rendered, "device")
+    left = 10
+    if change != "killed before its second table":
+        time.sleep(0.05)  # A file counts as unchanged if it is older than the table.
+        frames.refresh()
+    file = frames.path(frames.names()[0])
+    if change == "one file touched":
+        file.touch()
+    elif change == "one file lost":
+        file.unlink()
+        left = 9
+    run = run_of_quality(tmp_path, 90)
+    run.frames.notice_changes()
+    measured = dropped.measure([], run)
+    assert (measured.streams, measured.share, measured.asks) == (left, 1.0, True)
+    run.frames.keep([])
+    assert run.frames.rows_of_all_settings() == {}
+    assert run.frames.untouched()
 
 
 def test_datasets_count_as_finished_work_after_their_frames_were_deleted(clone: Path) -> None:
