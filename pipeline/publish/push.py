@@ -9,7 +9,7 @@ of huggingface_hub leaves notes among the files, shows half a dataset meanwhile,
 write.)
 """
 
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ from pipeline.files import checksum, read_json
 from pipeline.formats.base import Format
 from pipeline.generated import read_record, unchanged
 from pipeline.grouping import grouped
-from pipeline.publish.card import REPOSITORY
+from pipeline.publish.card import CHECKSUMS, REPOSITORY
 from pipeline.publish.repository import UPLOAD, Content, LastUpload, Repository, content_of, deletions, files_of, read
 from pipeline.run.export import OFT_STATISTICS
 from pipeline.run.layout import CARD, FINETUNE
@@ -101,6 +101,8 @@ def prepare(target: Format[Any], run: Run) -> Upload:
         for path, source in unchanged(run.path(folder), below).items():
             name = inside + path.removeprefix(f"{below}/")
             others[name], sha256[name] = source, checksums[path]
+    if CHECKSUMS in others:
+        _refuse_other_dataset(others[CHECKSUMS], sha256, dataset)
     for name, recorded_sha256 in read_record(run.path(CARD)).basis.requested.items():
         source = run.path(name)
         if source.is_symlink() or checksum(source) != recorded_sha256:
@@ -274,6 +276,21 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
     if missing:
         raise PipelineError(f"{len(missing)} files are missing, such as {missing[0]}", where=root, remedy=MAKE_AGAIN)
     return files
+
+
+def _refuse_other_dataset(checksums: Path, sha256: Mapping[str, str], dataset: Iterable[str]) -> None:
+    """Raise an error if the card was generated for other files of the dataset, such as those of other options."""
+    described: dict[str, str] = {}
+    for line in checksums.read_text().splitlines():
+        file_sha256, _, path = line.partition("  ")
+        described[path] = file_sha256
+    differing = [path for path in dataset if described.get(path) != sha256[path]]
+    if differing:
+        raise PipelineError(
+            f"the card describes another dataset: {len(differing)} files differ, such as {differing[0]}",
+            where=checksums,
+            remedy=MAKE_AGAIN,
+        )
 
 
 def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:

@@ -10,10 +10,10 @@ import pytest
 from conftest import REPOSITORY, Once, dvc, rot
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from synthetic import SET
-from validated_run import NAME, RUN, prepare, write_run
+from validated_run import NAME, RUN, prepare, write_card, write_run
 
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import checksum, replaced
 from pipeline.publish.card import REPORTS
 
 
@@ -183,6 +183,22 @@ def test_a_run_that_repeats_its_checks_with_the_same_result_may_be_uploaded(data
     files = prepare(data, "lerobot").files
     (data / "validation.json").touch()
     assert prepare(data, "lerobot").files == files
+
+
+def test_refuses_the_card_of_an_earlier_dataset(data: Path) -> None:
+    """As after a change of the format's options, where the stage ``card`` stopped because of another card's edits."""
+    write_card(data, checksums=True)
+    assert "SHA256SUMS" in prepare(data, "lerobot").others
+    info, record_file = data / "lerobot" / NAME / "meta" / "info.json", data / "lerobot.json"
+    info.write_bytes(info.read_bytes() + b"\n")
+    record = json.loads(record_file.read_text())
+    record["files"][f"{NAME}/meta/info.json"] = checksum(info)
+    record_file.write_text(json.dumps(record))
+    (data / "validation.json").touch()
+    with pytest.raises(PipelineError, match=r"describes another dataset: 1 files differ, such as meta/info\.json"):
+        prepare(data, "lerobot")
+    write_card(data, checksums=True)
+    assert prepare(data, "lerobot").files
 
 
 def test_files_beside_the_card_of_another_format_stop_nothing(data: Path) -> None:

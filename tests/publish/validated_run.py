@@ -47,10 +47,14 @@ def write_run(data: Path) -> None:
     write_card(data)
 
 
-def write_card(data: Path) -> None:
+def write_card(data: Path, *, checksums: bool = False) -> None:
     made_from = {name: checksum(data / name) for name in ("manifest.parquet", *REPORTS)}
     with generated(data / "card", made_from) as card:
         for kind in ("rlds", "lerobot", "lerobot_v21"):
             (card / kind / "pictures").mkdir(parents=True)
             (card / kind / "README.md").write_text(f"---\nlicense: mit\n---\n{kind}: hf download OWNER/NAME\n")
             (card / kind / "pictures" / "camera.png").write_bytes(b"picture")
+            if checksums:
+                files = json.loads((data / f"{kind}.json").read_text())["files"]
+                lines = [f"{sha256}  {path.removeprefix(f'{NAME}/')}\n" for path, sha256 in files.items()]
+                (card / kind / "SHA256SUMS").write_text("".join(lines))
