@@ -120,8 +120,7 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
             refused += reasons
             if accepted:
                 stored[component] += tuple(accepted)
-                bank.setdefault(task.suite, {})[task.name] = stored
-                _write(bank, out)
+                _add(accepted, component, task, out)
             print(f"{component}: {len(stored[component])} of {per_class}{_because(reasons)}")
     if any(len(stored[component]) < per_class for component in CLASSES):
         counts = ", ".join(f"{component} {len(stored[component])}" for component in CLASSES)
@@ -213,6 +212,15 @@ def tidy(text: str) -> str:
     """Convert to lower case and remove surplus white space, outer quotation marks and final punctuation."""
     plain = " ".join(text.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split())
     return plain.strip("\"'`, \N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}").rstrip(".!? ")
+
+
+def _add(accepted: Sequence[str], component: Component, task: Task, path: Path) -> None:
+    """Add rewrites to the bank in ``path``, which a person or another command may have changed meanwhile."""
+    bank = read_bank(path) if path.exists() else {}
+    stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
+    stored[component] = (*stored[component], *accepted)
+    bank.setdefault(task.suite, {})[task.name] = stored
+    _write(bank, path)
 
 
 def _write(bank: Bank, path: Path) -> None:

@@ -274,6 +274,22 @@ def test_a_run_that_stopped_goes_on(server: Server, tmp_path: Path) -> None:
     assert len(server.asked) == asked
 
 
+def test_rewrites_that_were_stored_during_an_answer_stay(server: Server, tmp_path: Path) -> None:
+    bank = tmp_path / "bank.yaml"
+    model = ask(server)
+    server.replies = lists(1, 1, 1, 1)
+
+    def ask_while_others_write(question: str) -> str:
+        answer = model(question)
+        if not bank.exists():
+            bank.write_text("libero_goal:\n  other_task:\n    paraphrase:\n    - leave this alone\n")
+        return answer
+
+    rewrite.extend(STOVE.bddl_file, bank, 1, ask_while_others_write)
+    assert counts(bank) == [1, 1, 1, 1]
+    assert yaml.safe_load(bank.read_text())["libero_goal"]["other_task"] == {"paraphrase": ["leave this alone"]}
+
+
 def test_nothing_in_a_bank_is_refused_by_the_lint_or_said_twice(server: Server, tmp_path: Path) -> None:
     mixed = [SENTENCES[0], SENTENCES[0].upper() + "!", "Turn on the stove", "x", "go to /dev", *SENTENCES[1:30]]
     server.replies = [says(json.dumps(mixed))]
