@@ -34,7 +34,7 @@ RECIPES: dict[Step, int] = {
     "physics": 8,
     "pixels": 7,
     "encoding": 4,
-    "evaluation": 3,
+    "evaluation": 4,
     "checks": 14,
     "pictures": 10,
 }

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, field_serializer
+from scipy.spatial.transform import Rotation
 
 from pipeline.axes import AXES, Perturbation
 from pipeline.axes.base import Frozen
@@ -213,7 +214,14 @@ class EpisodeEnvironment:
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
-        """Return the observation of a policy in vla-eval's names: ``images``, ``states`` (8,), ``task_description``."""
+        """Return the observation of a policy in vla-eval's names.
+
+        Returns:
+            ``images`` and ``task_description``, and with ``wanted.state`` two states (8,) of the end effector, with
+            position (m), axis-angle (rad) and fingers (m): ``states`` in the frame of the hand, and
+            ``controller_states`` in the frame of robosuite's controller, which is turned by 90 degrees about the
+            approach axis. X-VLA was trained with the latter.
+        """
         views: Iterable[str] = ()
         if wanted.images:
             views = VIEWS if wanted.wrist else ("agentview",)
@@ -226,6 +234,10 @@ class EpisodeEnvironment:
             if wanted.shortest_rotation and angle_rad > np.pi:
                 state[3:6] *= (angle_rad - 2 * np.pi) / angle_rad
             observation["states"] = state
+            controller = self.simulator.controller
+            angles = Rotation.from_matrix(controller.ee_ori_mat).as_rotvec()
+            of_controller = np.concatenate([controller.ee_pos, angles, state[6:]])
+            observation["controller_states"] = of_controller.astype(np.float32)
         return observation
 
     def close(self) -> None:

@@ -145,6 +145,7 @@ class Server:
         self._loop = asyncio.new_event_loop()
         self._connection = Connection(address, timeout=timeout_s, max_retries=3)
         self._connect()
+        self._announcement = self._connection.server_info
         self._seen: dict[str, Any] = {}
 
     def begin(self, task: EvaluationTask) -> None:
@@ -153,6 +154,7 @@ class Server:
         if not self._connection.is_connected:
             self._connect()
         self._run(self._connection.start_episode({"task": task.for_harness()}), self._connection.timeout)
+        self._announcement = self._connection.server_info
 
     def act(self, look: Look) -> Any:
         """Return the server's answer, (n, 7) or (7,), to the current or the last observation.
@@ -165,6 +167,9 @@ class Server:
         if not self._connection.is_connected:
             raise self._fault("the connection was closed")
         answer = self._run(self._connection.act(self._seen), self._connection.timeout)
+        # vla-eval connects again by itself. A new connection has a new announcement, and does not know the episode.
+        if self._connection.server_info is not self._announcement:
+            raise self._fault("the connection was lost in the episode")
         if not isinstance(answer, dict):
             raise self._fault(f"the model server answers with {type(answer).__name__}")
         actions = answer.get("actions", answer.get("action"))
@@ -341,7 +346,7 @@ class Checkpoint:
         folder: folder with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
 
     Raises:
-        PipelineError: if the policy wants an image that the tasks do not have.
+        PipelineError: if the policy wants an image that the tasks do not have, or if its weights were not loaded.
     """
 
     wanted = Wanted()
@@ -357,8 +362,9 @@ class Checkpoint:
         config.pretrained_path = folder
         if config.device is None or (config.device.startswith("cuda") and not torch.cuda.is_available()):
             config.device = "cpu"
+        weights = _weights_of(folder)
         self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
-        _refuse_other_weights(self._policy.state_dict(), folder)
+        _refuse_other_weights(self._policy.state_dict(), weights)
         self._policy.eval()
         self._before, self._after = make_pre_post_processors(
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
@@ -399,7 +405,24 @@ COMPARED_TENSORS = 20
 """Number of a checkpoint's tensors that are compared with those of the loaded policy."""
 
 
-def _refuse_other_weights(loaded: Mapping[str, Any], folder: Path) -> None:
+def _weights_of(folder: Path) -> Path:
+    """Return the file of a checkpoint's weights.
+
+    Raises:
+        PipelineError: if there is no such file.
+    """
+    file = folder / "model.safetensors"
+    if not file.is_file():
+        raise PipelineError(
+            "the checkpoint has no weights of its own",
+            where=file,
+            expected="the weights in one file; an adapter alone is not loaded",
+            remedy="merge the adapter (LoRA) into the weights, and save the policy",
+        )
+    return file
+
+
+def _refuse_other_weights(loaded: Mapping[str, Any], file: Path) -> None:
     """Compare some tensors of the loaded policy, evenly chosen by name, with those of the checkpoint.
 
     lerobot's pi0.5 prints a line and keeps random weights if it fails to load them (huggingface/lerobot#4577).
@@ -409,9 +432,6 @@ def _refuse_other_weights(loaded: Mapping[str, Any], folder: Path) -> None:
     """
     from safetensors import safe_open
 
-    file = folder / "model.safetensors"
-    if not file.is_file():  # Adapters and other forms of weights.
-        return
     with safe_open(file, "pt") as weights:
         names = sorted(loaded.keys() & {*weights.keys()})
         chosen = names[:: max(1, len(names) // COMPARED_TENSORS)]

@@ -143,14 +143,24 @@ def refuse_unmarked(folder: Path) -> None:
 
 
 def refuse_other_folder(file: Path) -> None:
-    """Reject a configuration whose folder differs from params.yaml, where DVC looks for the files of stages.
+    """Reject a configuration whose run is not where DVC looks for the files of stages, by params.yaml.
 
     Raises:
-        PipelineError: naming both folders.
+        PipelineError: naming both folders, or both names.
     """
     config = load(file)
     chosen = yaml.safe_load(PARAMS.read_text()) if PARAMS.is_file() else None
-    if isinstance(chosen, dict) and chosen.get("run") == file.stem and chosen.get("data") != config.folder.as_posix():
+    if not isinstance(chosen, dict) or chosen.get("run") != file.stem:
+        return
+    if config.name != file.stem:
+        raise PipelineError(
+            f"`name: {config.name}` differs from the name of the file, and DVC would look into another folder",
+            where=file,
+            expected=f"name: {file.stem}",
+            remedy=f"rename the file to {config.name}.yaml and write `run: {config.name}` into {PARAMS}; or use "
+            "`python -m pipeline run`",
+        )
+    if chosen.get("data") != config.folder.as_posix():
         raise PipelineError(
             f"`data: {chosen.get('data')}` differs from `folder: {config.folder}` in {file}",
             where=PARAMS,

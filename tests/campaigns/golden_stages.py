@@ -81,9 +81,11 @@ def evaluation() -> dict[str, Any]:
         environment.step([0.5, -0.5, 0.5, 0.1, 0.0, 0.0, 1.0])
         seen.append(environment.observation(Wanted(images=False)))
     environment.close()
-    states = [np.round(observation["states"].astype(float), 5).tolist() for observation in seen]
+    states: dict[str, Any] = {}
+    for key in ("states", "controller_states"):
+        states[key] = [np.round(observation[key].astype(float), 5).tolist() for observation in seen]
     instructions = {observation["task_description"] for observation in seen}
-    return {"step limits": dict(STEP_LIMITS), "told": sorted(instructions), "states": states}
+    return {"step limits": dict(STEP_LIMITS), "told": sorted(instructions), **states}
 
 
 def checks() -> dict[str, Any]:

@@ -15,8 +15,9 @@ import pytest
 from conftest import REPOSITORY, STOVE
 from episode_results import result
 from libero_environment import OffScreenRenderEnv, transform
+from numpy.typing import NDArray
 from server_process import replaying
-from vla_eval.rotation import quat_to_axisangle
+from vla_eval.rotation import matrix_to_quat, quat_to_axisangle
 
 from pipeline.__main__ import main
 from pipeline.axes.camera import CameraPerturbation
@@ -42,17 +43,26 @@ FIRST = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))[0]
 
 @pytest.fixture(scope="module")
 def libero() -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:  # type: ignore[type-arg]
-    """State and observation after settling and after each action, by LIBERO's own code as OpenVLA evaluates."""
+    """State and observation after settling and after each action, by LIBERO's own code as OpenVLA evaluates.
+
+    The observation also has ``controller_states``, as vla-eval's class for LIBERO computes them.
+    """
     env = OffScreenRenderEnv(bddl_file_name=str(STOVE.bddl_file), camera_heights=256, camera_widths=256)
     env.seed(0)
     env.reset()
     env.set_init_state(libero_states(STOVE)[0])
     for _ in range(10):
         observation, *_ = env.step([0.0] * 6 + [-1.0])
-    seen = [(env.get_sim_state(), observation)]
+    controller = env.robots[0].controller
+
+    def of_controller() -> NDArray[np.float32]:
+        angles = quat_to_axisangle(matrix_to_quat(np.asarray(controller.ee_ori_mat, np.float32)))
+        return np.array([*controller.ee_pos, *angles, *observation["robot0_gripper_qpos"]], np.float32)
+
+    seen = [(env.get_sim_state(), {**observation, "controller_states": of_controller()})]
     for action in ACTIONS:
         observation, *_ = env.step([*action[:6], -1.0 if action[6] < 0 else 1.0])
-        seen.append((env.get_sim_state(), observation))
+        seen.append((env.get_sim_state(), {**observation, "controller_states": of_controller()}))
     env.close()
     return seen
 
@@ -89,6 +99,7 @@ def test_episodes_are_liberos_bit_for_bit(
             ours = evaluated.observation(Wanted())
             expected = [theirs["robot0_eef_pos"], transform.quat2axisangle(quat_xyzw), theirs["robot0_gripper_qpos"]]
             assert np.array_equal(ours["states"], np.concatenate(expected).astype(np.float32))
+            np.testing.assert_allclose(ours["controller_states"], theirs["controller_states"], atol=1e-5)
             assert np.array_equal(ours["images"]["agentview"], to_policy(theirs["agentview_image"])), step
             assert np.array_equal(ours["images"]["wrist"], to_policy(theirs["robot0_eye_in_hand_image"])), step
         assert ours["task_description"] == STOVE.instruction

@@ -1,7 +1,11 @@
 """A policy that fails costs the episode that it fails in."""
 
+import asyncio
 import json
+import queue
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -10,6 +14,7 @@ from typing import Any
 import checkpoints
 import numpy as np
 import pytest
+import websockets
 from anyio.from_thread import start_blocking_portal
 from conftest import REPOSITORY, STOVE
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -22,6 +27,8 @@ from vla_eval.model_servers.base import ModelServer
 from vla_eval.model_servers.groot import GR00TModelServer
 from vla_eval.model_servers.serve import serve_async
 from vla_eval.model_servers.xvla import _PROFILE_OBS_PARAMS as XVLA
+from vla_eval.protocol.messages import Message, MessageType, make_hello_payload, pack_message, unpack_message
+from websockets.asyncio.server import ServerConnection
 
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop
@@ -126,6 +133,10 @@ def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_refused(
     """lerobot 0.6.1's pi0.5 keeps random weights after a failure, as this stand-in does."""
     folder = checkpoints.save(tmp_path, 0.25)
     Checkpoint(folder)
+    (folder / "model.safetensors").rename(folder / "kept")
+    with pytest.raises(PipelineError, match="no weights of its own"):
+        Checkpoint(folder)
+    (folder / "kept").rename(folder / "model.safetensors")
     monkeypatch.setattr(ACTPolicy, "from_pretrained", classmethod(lambda kind, _, config: kind(config)))
     with pytest.raises(PipelineError, match=r"model\.safetensors: lerobot did not load the weights \(model\."):
         Checkpoint(folder)
@@ -178,3 +189,53 @@ def test_a_server_that_dies_ends_the_run(
     assert "Traceback" not in told
     assert "run the same command again" in told
     assert not any(row.base.startswith("pick_up_the_milk") for row in EpisodeFiles(tmp_path).rows())
+
+
+@pytest.mark.parametrize("aborted", [False, True], ids=["closed", "aborted"])
+def test_an_episode_whose_server_was_restarted_has_no_result(aborted: bool) -> None:
+    """The server closes its first connection after one answer, while the simulator works, and accepts a new one."""
+    connections: list[list[MessageType]] = []
+
+    async def serve_episode(socket: ServerConnection) -> None:
+        received: list[MessageType] = []
+        connections.append(received)
+        is_first = len(connections) == 1
+        async for raw in socket:
+            message = unpack_message(raw)
+            received.append(message.type)
+            if message.type == MessageType.HELLO:
+                payload = make_hello_payload(model_server="restarted", capabilities={})
+                await socket.send(pack_message(Message(type=message.type, payload=payload, seq=message.seq)))
+            elif message.type == MessageType.OBSERVATION:
+                payload = {"actions": np.zeros(7, np.float32)}
+                await socket.send(pack_message(Message(type=MessageType.ACTION, payload=payload, seq=message.seq)))
+                if is_first:
+                    await asyncio.sleep(0.1)
+                    if aborted:
+                        socket.transport.abort()
+                    return
+
+    ports: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    async def serve() -> None:
+        async with websockets.serve(serve_episode, "127.0.0.1", 0, ping_interval=None) as server:
+            ports.put(server.sockets[0].getsockname()[1])
+            await asyncio.Future()
+
+    threading.Thread(target=lambda: asyncio.run(serve()), daemon=True).start()
+    policy = Server(f"ws://127.0.0.1:{ports.get()}", timeout_s=5)
+    task = libero_task(STOVE, 0)
+
+    def look(wanted: Wanted) -> dict[str, Any]:
+        return {"images": {}, "task_description": ""}
+
+    policy.begin(task)
+    policy.act(look)
+    time.sleep(0.3)
+    with pytest.raises(PolicyError, match=r"the connection was (lost in the episode|closed)"):
+        policy.act(look)
+    policy.begin(task)
+    policy.act(look)
+    policy.close()
+    last = connections[-1]
+    assert last[last.index(MessageType.EPISODE_START) :][:2] == [MessageType.EPISODE_START, MessageType.OBSERVATION]

@@ -22,7 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.generated import generated
 from pipeline.libero import hdf5
 from pipeline.planning import plan
-from pipeline.run.claim import LOCK, OWNER, claimed, locked, owned
+from pipeline.run.claim import LOCK, OWNER, claimed, locked, owned, refuse_other_folder
 
 
 @pytest.fixture
@@ -50,6 +50,24 @@ def test_a_copy_with_the_old_name_is_refused_before_anything_else(clone: Path) -
     assert done.stderr.startswith("error: data/tiny: the folder belongs to configs/tiny.yaml")
     assert "change `name:` in configs/copy.yaml" in done.stderr
     assert {file: file.stat().st_mtime_ns for file in clone.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("name", "other", "`name: other` differs from the name of the file"),
+        ("folder", "elsewhere", "`data: data` diff"),
+    ],
+)
+def test_dvc_s_run_must_be_where_dvc_looks(clone: Path, field: str, value: str, message: str) -> None:
+    file = Path("configs/tiny.yaml")
+    Path("params.yaml").write_text("run: tiny\ndata: data\n")
+    refuse_other_folder(file)
+    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), field: value}))
+    with pytest.raises(PipelineError, match=message):
+        refuse_other_folder(file)
+    Path("params.yaml").write_text("run: starter\ndata: data\n")
+    refuse_other_folder(file)
 
 
 def test_push_refuses_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
