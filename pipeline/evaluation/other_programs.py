@@ -82,10 +82,15 @@ class _VlaEvalConfig(BaseModel):
 
 
 class _VlaEvalFile(BaseModel):
-    """Content of vla-eval's file, as far as it is used."""
+    """Content of vla-eval's file, as far as it is used.
+
+    Attributes:
+        partial: true if episodes of the evaluation never ran.
+    """
 
     config: _VlaEvalConfig
     tasks: list[_VlaEvalTask]
+    partial: bool = False
 
 
 class _LerobotMetrics(BaseModel):
@@ -269,7 +274,7 @@ def _vla_eval_episodes(file: Path) -> list[_Episode]:
     """Read the episodes of vla-eval's file of one benchmark.
 
     Raises:
-        PipelineError: if the file is damaged, or its benchmark is not LIBERO-Plus.
+        PipelineError: if the file is damaged or not finished, or its benchmark is not LIBERO-Plus.
     """
     content = _parsed(_VlaEvalFile, file, "a file that vla-eval 0.8.0 wrote next to its recording")
     name = content.config.benchmark.rpartition(":")[2]
@@ -281,6 +286,13 @@ def _vla_eval_episodes(file: Path) -> list[_Episode]:
             remedy="leave this file out, or move it to another folder",
         )
     ours = name == "PerturbedLibero"
+    if content.partial:
+        raise PipelineError(
+            "the evaluation was not finished, and its finished tasks are no random sample of the benchmark",
+            where=file,
+            expected="a file of vla-eval without `partial`",
+            remedy="run vla-eval again with the same --eval-id, which completes the evaluation",
+        )
     settings = _settings(content.config, file) if ours else None
     limit = content.config.max_steps or content.config.params.get("max_steps")
     episodes = []

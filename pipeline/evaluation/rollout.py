@@ -22,7 +22,14 @@ from pipeline.evaluation.actions import checked_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.results import PER_TASK, RECORDED, EpisodeFiles, EpisodeResult, refuse_shared_names
+from pipeline.evaluation.results import (
+    PER_TASK,
+    RECORDED,
+    EpisodeFiles,
+    EpisodeResult,
+    one_setting,
+    refuse_shared_names,
+)
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum_of, edition
 from pipeline.libero.tasks import SUITES, find_task
@@ -137,7 +144,8 @@ class Evaluation:
         """Read the up-to-date results on test tasks of this policy under these settings, of any selection.
 
         Raises:
-            PipelineError: if a file is not a result of this version.
+            PipelineError: if a file is not a result of this version, or if the policy used other views or states in
+                some of the results.
         """
         results: list[EpisodeResult] = []
         for row in self.files.rows():
@@ -146,6 +154,7 @@ class Evaluation:
             task, *_ = row.trial
             if row.episode == self.episode(task) and _record(row).matches(self.basis(task)):
                 results.append(row)
+        one_setting([(row, self.files) for row in results])
         return results
 
     def check(self, tasks: Iterable[EvaluationTask]) -> None:

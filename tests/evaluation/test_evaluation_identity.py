@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -20,9 +21,9 @@ from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws, results
-from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, Progress
 from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
-from pipeline.evaluation.policies import Checkpoint
+from pipeline.evaluation.policies import Checkpoint, Wanted
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
@@ -41,6 +42,23 @@ def short() -> Iterator[None]:
         patch.setitem(STEP_LIMITS, STOVE.suite, STEPS)
         yield
     _environment(SETTINGS, None).close()
+
+
+def test_the_table_of_test_tasks_is_of_one_observation(tmp_path: Path) -> None:
+    """As where a server with one label is started again, and then does not ask for the state."""
+    done = evaluation(PolicyConfig(kind="server", address="ws://localhost:1", label="p"), tmp_path)
+
+    def save(axis: str, wanted: Wanted) -> None:
+        for task in select(Selection(source="libero_plus", suites=(STOVE.suite,), axes=(axis,), subset=2)):
+            ended = {"task": task, "progress": Progress(9, "success"), "perturbations": (), "instruction": "x"}
+            environment: Any = SimpleNamespace(**ended, step_limit=STEPS, looks=5)
+            done.save(environment, wanted)
+
+    save("camera", Wanted(state=True))
+    assert len(done.test_results()) == 2
+    save("robot", Wanted(state=False))
+    with pytest.raises(PipelineError, match="several policies or settings"):
+        done.test_results()
 
 
 @pytest.fixture

@@ -408,6 +408,16 @@ def test_an_episode_without_the_metric_success_is_left_out(tmp_path: Path) -> No
     assert (len(policy.outcomes), policy.left_out) == (1, 1)
 
 
+def test_an_unfinished_evaluation_of_vla_eval_is_no_row(tmp_path: Path) -> None:
+    """vla-eval runs the tasks in the benchmark's order, so the finished ones are of the first axes and tasks."""
+    tests = first_of("libero_goal", "robot", 2)
+    config = {"benchmark": THEIR_CLASS, "params": {"suite": "libero_goal"}}
+    file = write_vla_eval(tmp_path, config, [(their_task(test, test.name), {"success": True}) for test in tests])
+    file.write_text(json.dumps({**json.loads(file.read_text()), "partial": True}))
+    with pytest.raises(PipelineError, match="was not finished"):
+        read_tested([tmp_path])
+
+
 @pytest.mark.parametrize("further", ["episodes/0.json", "eval_info.json"])
 def test_results_of_two_programs_in_a_folder_are_rejected(tmp_path: Path, further: str) -> None:
     (test,) = first_of("libero_goal", "robot")
