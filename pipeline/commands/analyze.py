@@ -216,26 +216,33 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
 @results_argument
 @config_argument
 def leakage(results: Path, config: Path) -> int:
-    """Measure how close the held-out perturbations of results come to the plan of a run.
+    """Measure how close the held-out perturbations and goals of results come to the plan of a run.
 
-    The results are those of `evaluate --source own`. The output is one line of JSON. The exit status is 1 if a
-    perturbation overlaps with the plan.
+    The results are those of `evaluate --source own` or `goals`. The output is one line of JSON. The exit status is 1 if
+    a perturbation overlaps with the plan, or if the plan trains on a goal.
     """
     from pipeline.axes import from_json
     from pipeline.evaluation import own_draws
     from pipeline.evaluation.results import stored
+    from pipeline.evaluation.tasks import goal_task
     from pipeline.libero.tasks import find_task
 
-    perturbations = []
+    perturbations, goals = [], []
     for row, _ in stored([results]):
+        if row.source == "goals":
+            task, *_ = row.trial
+            goals.append(goal_task(task)[1])
         if row.source != "own":
             continue
         for perturbation in from_json(json.dumps(row.perturbations)):
             perturbations.append((row.name, perturbation, find_task(row.suite, row.base)))
-    if not perturbations:
+    if not perturbations and not goals:
         raise PipelineError(
-            "the results have no held-out perturbations", where=results, remedy="run `evaluate --source own`"
+            "the results have no held-out perturbations and goals", where=results, remedy="run `evaluate --source own`"
         )
-    findings = own_draws.compare(perturbations, own_draws.planned(open_run(config).plan_file))
+    planned = own_draws.planned(open_run(config).plan_file)
+    findings = own_draws.compare(perturbations, planned)
+    if goals:
+        findings["goal"] = {"draws": len(goals), "overlaps": sum(goal in planned.goals for goal in goals)}
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

@@ -25,7 +25,7 @@ from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import checked_actions, refuse_other_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.evaluate import check_settings
+from pipeline.evaluation.evaluate import check_settings, not_trained
 from pipeline.evaluation.policies import NextLook, Wanted, is_shortest
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
@@ -107,8 +107,9 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """Return one task per episode; ``name`` is unique, ``suite`` is LIBERO's."""
-        tasks = select(self._selection, self._archive)
-        check_settings(self._selection, tasks, self._environment.settings)
+        settings = self._environment.settings
+        tasks = not_trained(select(self._selection, self._archive), settings.plan)
+        check_settings(self._selection, tasks, settings)
         if self._evaluation is not None:
             self._evaluation.check(tasks)
         return [task.for_harness() for task in tasks]

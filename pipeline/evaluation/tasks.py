@@ -229,6 +229,8 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
     region next to a plate is named after the plate). It is the only object of its category, and its words mean it
     alone.
 
+    No task of LIBERO asks for the new goal.
+
     The new object fits in the old object's place if one of LIBERO's 130 tasks puts its category on or in a thing of
     this kind. It also fits if it is no larger than an object that one of these tasks puts there.
     """
@@ -250,9 +252,21 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
             if new in taken or categories.count(category) > 1 or not _fits(category, relation, place, scene):
                 continue
             instruction = _reworded(task, old, category)
-            if instruction is not None:
-                possible.append(Replacement(old, new, category, instruction))
+            if instruction is None:
+                continue
+            replacement = Replacement(old, new, category, instruction)
+            if _parsed(replacement.bddl_text(task), replacement).asked not in _goals_of_libero():
+                possible.append(replacement)
     return tuple(possible)
+
+
+@cache
+def _goals_of_libero() -> frozenset[Hashable]:
+    """Return the goals of LIBERO's 130 tasks, each in its scene."""
+    listed: list[Task] = []
+    for suite in SUITES:
+        listed += tasks(suite)
+    return frozenset(definition_of(task).asked for task in listed)
 
 
 def find_replacement(task: Task, name: str) -> Replacement:

@@ -1,5 +1,6 @@
 """A policy can be asked for another goal, told nothing, or shown black views, and nothing else changes."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -7,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import STOVE
+from episode_results import analyze, result
 
 from pipeline.axes.goal import GoalPerturbation, held_out
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import not_trained
+from pipeline.evaluation.harness import PerturbedLibero
 from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import CARRIED, EvaluationTask, find_replacement, goal_task, replacements
 from pipeline.libero import bddl
@@ -27,10 +31,8 @@ def test_goals_are_replaced_by_what_fits_and_is_named_alone() -> None:
     def asked(suite: str, name: str) -> set[str]:
         return {one.instruction for one in replacements(find_task(suite, name))}
 
-    assert asked("libero_goal", "put_the_bowl_on_top_of_the_cabinet") == {
-        "put the cream cheese on top of the cabinet",
-        "put the wine bottle on top of the cabinet",
-    }
+    # The wine bottle on top of the cabinet is a task of LIBERO.
+    assert asked("libero_goal", "put_the_bowl_on_top_of_the_cabinet") == {"put the cream cheese on top of the cabinet"}
     between = "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
     assert asked("libero_spatial", between) == {
         "pick up the cookie box and place it on the plate",
@@ -43,6 +45,21 @@ def test_goals_are_replaced_by_what_fits_and_is_named_alone() -> None:
         "libero_10", "LIVING_ROOM_SCENE2_put_both_the_alphabet_soup_and_the_tomato_sauce_in_the_basket"
     )
     assert not asked("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove")
+
+
+def test_no_goal_is_that_of_a_task_of_libero() -> None:
+    """Compared by the things, places and relations of the BDDL files, which ``carried`` does not read here."""
+
+    def goal_and_scene(definition: bddl.Bddl) -> tuple[object, ...]:
+        return definition.arena, frozenset(definition.objects.items()), frozenset(definition.goal)
+
+    of_libero = {goal_and_scene(bddl.read(task.bddl_file)) for suite in SUITES for task in tasks(suite)}
+    listed = [task for task in select(Selection(source="goals")) if CARRIED not in task.name]
+    assert len(listed) == 108
+    for task in listed:
+        base = find_task(task.suite, task.base)
+        text = find_replacement(base, task.name).bddl_text(base)
+        assert goal_and_scene(bddl.parse(text, task.name)) not in of_libero, task.name
 
 
 def test_a_goal_task_changes_nothing_but_its_goal() -> None:
@@ -81,13 +98,23 @@ def test_goals_that_a_plan_trains_on_are_left_out(tmp_path: Path, capsys: pytest
     soup = find_task("libero_object", "pick_up_the_alphabet_soup_and_place_it_in_the_basket")
     (entry,) = DemosConfig(tasks=(str(milk),)).index().entries
     change = GoalPerturbation(scene=soup.name, start=0, level=3)
-    plan.write([plan.row(entry, (change,), 0, ReplayConfig())], tmp_path / "plan.parquet")
+    config, file = tmp_path / "mine.yaml", tmp_path / "mine" / "plan.parquet"
+    config.write_text(f"name: mine\nfolder: {tmp_path}\nplan:\n  episodes: {{robot: 1}}\n")
+    file.parent.mkdir()
+    plan.write([plan.row(entry, (change,), 0, ReplayConfig())], file)
     wanted = select(Selection(source="goals", suites=("libero_object",)))
-    left = not_trained(wanted, tmp_path / "plan.parquet")
+    left = not_trained(wanted, file)
     (out,) = set(wanted) - set(left)
     assert (out.base, out.component) == (soup.name, "milk")
     assert capsys.readouterr().out == "left out, because the plan trains on them: 1 of 50 goals\n"
     assert not_trained(wanted, None) == wanted
+    selection = {"source": "goals", "suites": ["libero_object"]}
+    assert len(PerturbedLibero(selection=selection, settings={"plan": str(file)}).get_tasks()) == len(left)
+    capsys.readouterr()
+    for task, overlaps in ((left[0], 0), (out, 1)):
+        EpisodeFiles(tmp_path / "results").save(result(task))
+        assert analyze("leakage", str(tmp_path / "results"), str(config)) == overlaps
+        assert json.loads(capsys.readouterr().out)["goal"]["overlaps"] == overlaps
 
 
 @pytest.mark.slow
@@ -120,7 +147,7 @@ NOUNS = {
 }
 """What people call a category whose name is not what they call it; two share the book."""
 
-GOALS = {"libero_spatial": 17, "libero_object": 50, "libero_goal": 14, "libero_10": 30, "libero_90": 109}
+GOALS = {"libero_spatial": 17, "libero_object": 50, "libero_goal": 12, "libero_10": 29, "libero_90": 34}
 
 
 @pytest.mark.parametrize("suite", SUITES)
