@@ -52,6 +52,7 @@ class Row(NamedTuple):
         rates: heading to the rate in percent; `None` if it was not measured.
         intervals: heading to the bounds of the 95 % interval in percent, of measured rates.
         partial: headings whose rate leaves out a part of the benchmark.
+        sampled: other headings whose rate is an estimate from some of the test tasks.
         tasks_run: heading of a column, or ``total``, to the number of test tasks with an episode.
         absent: column to the left-out parts.
     """
@@ -68,6 +69,7 @@ class Row(NamedTuple):
     rates: Mapping[str, str | None]
     intervals: Mapping[str, tuple[str, str]]
     partial: frozenset[str]
+    sampled: Mapping[str, str]
     tasks_run: Mapping[str, int]
     absent: Mapping[str, str]
 
@@ -79,18 +81,30 @@ def rows_of(table: Mapping[str, Any]) -> list[Row]:
         table: the result of ``table_of``.
     """
     return [
-        *(_evaluated(row) for row in table["evaluated"]),
+        *(_evaluated(row, table["tasks"]) for row in table["evaluated"]),
         *(_published(row, table) for row in table["published"]),
     ]
 
 
-def _evaluated(row: Mapping[str, Any]) -> Row:
-    """Return the row of an evaluated policy."""
+def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
+    """Return the row of an evaluated policy.
+
+    Args:
+        sizes: column to the number of its test tasks.
+    """
     cells, protocol = row["cells"], row["protocol"]
     estimates = {**cells, "total": row["total"], "mean of seven": row["mean"]}
     measured = {heading: estimate for heading, estimate in estimates.items() if estimate is not None}
     absent = {column: cell["absent"] for column, cell in cells.items() if cell["absent"]}
     tasks_run = {column: cells[column]["tasks"] if column in cells else 0 for column in DIMENSIONS}
+    partial = frozenset([*absent, "total", "mean of seven"] if absent else ())
+    counts = {**tasks_run, "total": sum(tasks_run.values())}
+    sampled: dict[str, str] = {}
+    for column in measured.keys() - partial:
+        of_column = column if column in counts else "total"
+        whole = sizes.get(of_column, sum(sizes.values()))
+        if counts[of_column] < whole:
+            sampled[column] = f"{counts[of_column]:,} of {whole:,}"
     fewest, most = protocol["trials"]
     return Row(
         name=row["name"],
@@ -106,8 +120,9 @@ def _evaluated(row: Mapping[str, Any]) -> Row:
         intervals={
             heading: (_percent(estimate["low"]), _percent(estimate["high"])) for heading, estimate in measured.items()
         },
-        partial=frozenset([*absent, "total", "mean of seven"] if absent else ()),
-        tasks_run={**tasks_run, "total": sum(tasks_run.values())},
+        partial=partial,
+        sampled={heading: sampled[heading] for heading in COLUMNS if heading in sampled},
+        tasks_run=counts,
         absent=absent,
     )
 
@@ -129,6 +144,7 @@ def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> Row:
         rates={heading: f"{rates[heading]:.1f}" for heading in COLUMNS},
         intervals={},
         partial=frozenset(),
+        sampled={},
         tasks_run={**table["tasks"], "total": protocol["tasks_run"]},
         absent={},
     )
@@ -155,7 +171,7 @@ def markdown(table: Mapping[str, Any]) -> str:
     rows = rows_of(table)
     sizes = {**table["tasks"], "total": sum(table["tasks"].values())}
     for row in rows:
-        cells = [_starred(row, heading, "*") or "-" for heading in COLUMNS]
+        cells = [_marked(row, heading, "*", "†") or "-" for heading in COLUMNS]
         lines.append(_line(f"{row.name} (published)" if row.published else row.name, cells))
         if not row.published:
             bounds = [" to ".join(row.intervals[name]) if name in row.intervals else "" for name in COLUMNS]
@@ -184,12 +200,17 @@ def _escaped(name: str) -> str:
     return MARKUP.sub(r"\\\g<0>", " ".join(name.split()))
 
 
-def _starred(row: Row, heading: str, star: str) -> str:
-    """Return a rate, with a star if it leaves out a part of the benchmark; empty if it was not measured."""
+def _marked(row: Row, heading: str, star: str, dagger: str) -> str:
+    """Return a rate, empty if it was not measured.
+
+    A star marks a rate without a part of the benchmark, a dagger another estimate from some of the test tasks.
+    """
     rate = row.rates[heading]
     if rate is None:
         return ""
-    return rate + star if heading in row.partial else rate
+    if heading in row.partial:
+        return rate + star
+    return rate + dagger if heading in row.sampled else rate
 
 
 def _notes(row: Row) -> Iterator[str]:
@@ -200,6 +221,12 @@ def _notes(row: Row) -> Iterator[str]:
     yield f"- {name}: {_protocol(row)}."
     for column, parts in row.absent.items():
         yield f"- \\* {name}, {column}: without {parts}."
+    if row.sampled:
+        yield f"- † {name}: estimated from some of the tasks, {_sampled(row)}."
+
+
+def _sampled(row: Row) -> str:
+    return ", ".join(f"{heading} {count}" for heading, count in row.sampled.items())
 
 
 def _protocol(row: Row) -> str:
@@ -263,12 +290,14 @@ def latex(table: Mapping[str, Any]) -> str:
     for row in rows_of(table):
         if row.published:
             continue
-        cells = [_starred(row, heading, "$^{*}$") or "--" for heading in COLUMNS]
+        cells = [_marked(row, heading, "$^{*}$", r"$^{\dagger}$") or "--" for heading in COLUMNS]
         name = "".join(LATEX.get(character, character) for character in " ".join(row.name.split()))
         # After the end of the line before, `[` and `*` would begin an option of that end.
         name = f"{{}}{name}" if name.startswith(("[", "*")) else name
         lines.append(f"% {_protocol(row)}")
         lines += [f"% * {column}: without {parts}" for column, parts in row.absent.items()]
+        if row.sampled:
+            lines.append(f"% dagger: estimated from some of the tasks, {_sampled(row)}")
         lines.append(f"{' & '.join([name, *cells])} \\\\")
     return "\n".join(lines) + "\n"
 

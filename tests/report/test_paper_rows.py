@@ -153,6 +153,22 @@ def test_a_rate_that_leaves_out_a_part_has_a_star_and_the_part_is_named() -> Non
     assert "% * layout: without confounding objects (829 tasks)" in latex(table).splitlines()
 
 
+def test_an_estimate_from_a_sample_of_every_part_has_a_dagger_and_its_number_of_tasks() -> None:
+    one_of_each_part: dict[tuple[str, str, int, str], TestTask] = {}
+    for test in benchmark.load().tasks:
+        one_of_each_part.setdefault((test.axis, test.component, level_of_test(test), test.suite), test)
+    camera = [test for test in benchmark.load().tasks if test.axis == "camera"]
+    tests = [*camera, *(test for test in one_of_each_part.values() if test.axis != "camera")]
+    table = table_of([TestedPolicy("sampled", scored(tests), "evaluate", "clean", {}, 0)])
+    (cells,) = of_latex(latex(table))
+    marked = {heading: cell.endswith(r"$^{\dagger}$") for heading, cell in zip(COLUMNS, cells[1:], strict=True)}
+    assert marked == {heading: heading != "camera" for heading in COLUMNS}
+    language = sum(test.axis == "language" for test in tests)
+    assert f"language {language} of 1,537" in latex(table)
+    assert f"language {language} of 1,537" in markdown(table)
+    assert markdown(table).count("†") == len(COLUMNS) - 1 + 1
+
+
 def test_several_trials_of_a_task_count_as_one_task() -> None:
     one, other = first_of("libero_goal", "robot", 2)
     one, other = (replace(test, suite="libero_goal") for test in (one, other))
