@@ -7,6 +7,7 @@ import os
 import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
@@ -27,7 +28,8 @@ MAX_NAMED = 20
 def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Iterator[Path]:
     """Yield an empty folder to write into; on success record its files and give it the place of ``folder``.
 
-    A killed process leaves the old folder, the new one or none.
+    A killed process leaves the old folder, the new one or none. Where ``REMAKE=1`` allows the loss of edits, the edited
+    folder stays next to the new one, as ``<folder>.edited_<number>``.
 
     Args:
         made_from: name of each file of the run that the content is generated from, to SHA-256.
@@ -40,11 +42,25 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
         unfinished.mkdir()
         yield unfinished
         files = {path: checksum(file) for path, file in _files(unfinished).items()}
-        _refuse_loss(folder, files)
+        lost = _lost_edits(folder, files)
+        if lost:
+            # The permission may have been given for other work.
+            old = _free_name(folder)
+            print(f"generated {folder} again; the edited files {in_words(lost)} are now in {old}")
         write_json(unfinished / RECORD, {"files": files, "made_from": dict(made_from or {})})
         if folder.exists():
             os.replace(folder, old)
-    remove(old)
+    if not lost:
+        remove(old)
+
+
+def _free_name(folder: Path) -> Path:
+    """Return the first unused name for the earlier content of a folder."""
+    for number in count(1):
+        path = folder.with_name(f"{folder.name}.edited_{number}")
+        if not path.exists():
+            return path
+    raise AssertionError("numbers do not end")
 
 
 def read_record(folder: Path) -> Record:
@@ -156,19 +172,20 @@ def in_words(found: Mapping[str, str]) -> str:
     return ", ".join(named[:MAX_NAMED] + further)
 
 
-def _refuse_loss(folder: Path, files: Mapping[str, str]) -> None:
-    """Stop if edits would be lost: edited files that differ from the new files."""
+def _lost_edits(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
+    """Return the edited files that differ from the new files, with the kind of edit.
+
+    Raises:
+        PipelineError: if there are such files, and ``REMAKE=1`` is not set.
+    """
     lost: dict[str, str] = {}
     for path, how in edits(folder).items():
         file = folder / path
         same = file.is_file() and not file.is_symlink() and checksum(file) == files.get(path)
         if not same:
             lost[path] = how
-    if not lost:
-        return
-    if os.environ.get(REMAKE) == "1":
-        print(f"generated {folder} again, and replaced the edited files {in_words(lost)}")
-        return
+    if not lost or os.environ.get(REMAKE) == "1":
+        return lost
     raise PipelineError(
         f"{len(lost)} edited files would be overwritten or deleted: {in_words(lost)}",
         where=folder,

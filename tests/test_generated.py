@@ -95,6 +95,11 @@ def test_an_edit_is_named_and_stays_until_it_is_allowed(
     assert EDITS[edit] in capsys.readouterr().out
     assert contents(folder) == {"one.txt": "another", "two.txt": "another"}
     assert edits(folder) == {}
+    kept = states(folder.with_name(f"{folder.name}.edited_1"))
+    assert sorted(kept.values()) == sorted(before.values()), "the edited files themselves"
+    edit(folder)
+    generate(folder, one="a third", two="a third")
+    assert folder.with_name(f"{folder.name}.edited_2").exists()
 
 
 def test_what_nobody_edited_is_replaced_without_a_word(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
