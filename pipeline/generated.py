@@ -28,8 +28,8 @@ MAX_NAMED = 20
 def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Iterator[Path]:
     """Yield an empty folder to write into; on success record its files and give it the place of ``folder``.
 
-    A killed process leaves the old folder, the new one or none. Where ``REMAKE=1`` allows the loss of edits, the edited
-    folder stays next to the new one, as ``<folder>.edited_<number>``.
+    A killed process leaves the old folder, the new one or none. If ``REMAKE=1`` allows the replacement of edits, the
+    edited folder stays next to the new one, as ``<folder>.edited_<number>``.
 
     Args:
         made_from: name of each file of the run that the content is generated from, to SHA-256.
