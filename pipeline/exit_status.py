@@ -26,6 +26,11 @@ SURROUNDINGS = {
     errno.EISDIR: ("a folder is in the place of a file", f"move it to another place, and {GO_ON}"),
     errno.ELOOP: ("symbolic links form a cycle", f"correct the links, and {GO_ON}"),
     errno.EMFILE: ("too many files are open", f"raise the limit (`ulimit -n 4096`), and {GO_ON}"),
+    errno.EXDEV: ("the folder is on another file system", f"keep the folder of a run on one file system, and {GO_ON}"),
+    errno.EBUSY: ("another program uses it", f"stop that program, or unmount it, and {GO_ON}"),
+    errno.ENOTEMPTY: ("another program writes into the folder or reads from it", f"stop that program, and {GO_ON}"),
+    errno.ESTALE: ("another machine deleted it", GO_ON),
+    errno.ENOLCK: ("the file system has no locks", f"mount it with locks, and {GO_ON}"),
     errno.EIO: ("the disk has an error", "run `python -m pipeline dataset check CONFIG`, which lists damaged files"),
 }
 """Error number of the system to its description and remedy. All other errors are bugs and keep their traceback."""
