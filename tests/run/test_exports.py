@@ -1,5 +1,6 @@
 """A killed export goes on to the same bytes and leaves nothing behind; what is finished is left alone."""
 
+import json
 import os
 import signal
 import subprocess
@@ -12,10 +13,12 @@ from typing import Any
 import pytest
 from synthetic import IDS, episode, episodes, files, loop
 
+from pipeline.files import checksum
 from pipeline.formats import lerobot
-from pipeline.formats.base import Format
+from pipeline.formats.base import Export, Format
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
+from pipeline.record import Basis
 from pipeline.run.export import export, is_current
 from pipeline.types import Episode
 
@@ -90,6 +93,8 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
     made, source = target(name, tmp_path), episodes()
     made.folder.mkdir()
     (made.folder / "earlier").write_text("dataset")
+    record = Export(Basis("earlier", "earlier"), {"earlier": checksum(made.folder / "earlier")})
+    made.record_file.write_text(json.dumps(record.to_json()))
     code = f"import test_exports as t, pathlib; t.killed_export({name!r}, pathlib.Path({str(tmp_path)!r}), {where!r})"
     done = subprocess.run(
         [sys.executable, "-c", code],
