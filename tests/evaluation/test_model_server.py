@@ -117,12 +117,14 @@ def test_the_server_receives_what_the_table_states_and_moves_the_hand_there(serv
     parts = {
         'obs["images"]["agentview"]': last["images"]["agentview"],
         'obs["images"]["wrist"]': last["images"]["wrist"],
+        'obs["states"]': last["states"],
+        'obs["controller_states"]': last["controller_states"],
     }
-    for name, part in {**parts, 'obs["states"]': last["states"]}.items():
+    for name, part in parts.items():
         assert table[name][0] == f"{part.shape} {part.dtype}", name
     assert last["task_description"] == "turn on the stove"
-    assert {*table} == {*parts, 'obs["states"]', 'obs["task_description"]'}
-    assert {*last} == {"images", "states", "task_description"}
+    assert {*table} == {*parts, 'obs["task_description"]'}
+    assert {*last} == {"images", "states", "controller_states", "task_description"}
     np.testing.assert_allclose(last["states"][:3], [0.05, -0.1, 1.15], atol=0.01)
     start, end = server.messages
     assert start["task"] == task.for_harness()
