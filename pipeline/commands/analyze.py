@@ -243,6 +243,6 @@ def leakage(results: Path, config: Path) -> int:
     planned = own_draws.planned(open_run(config).plan_file)
     findings = own_draws.compare(perturbations, planned)
     if goals:
-        findings["goal"] = {"draws": len(goals), "overlaps": sum(goal in planned.goals for goal in goals)}
+        findings["goals"] = {"draws": len(goals), "overlaps": sum(goal in planned.goals for goal in goals)}
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

@@ -114,7 +114,7 @@ def test_goals_that_a_plan_trains_on_are_left_out(tmp_path: Path, capsys: pytest
     for task, overlaps in ((left[0], 0), (out, 1)):
         EpisodeFiles(tmp_path / "results").save(result(task))
         assert analyze("leakage", str(tmp_path / "results"), str(config)) == overlaps
-        assert json.loads(capsys.readouterr().out)["goal"]["overlaps"] == overlaps
+        assert json.loads(capsys.readouterr().out)["goals"]["overlaps"] == overlaps
 
 
 @pytest.mark.slow
