@@ -56,11 +56,8 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
 
 def _free_name(folder: Path) -> Path:
     """Return the first unused name for the earlier content of a folder."""
-    for number in count(1):
-        path = folder.with_name(f"{folder.name}.edited_{number}")
-        if not path.exists():
-            return path
-    raise AssertionError("numbers do not end")
+    names = (folder.with_name(f"{folder.name}.edited_{number}") for number in count(1))
+    return next(path for path in names if not path.exists())
 
 
 def read_record(folder: Path) -> Record:

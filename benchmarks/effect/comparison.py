@@ -245,13 +245,10 @@ def _first_state_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
 
     An empty list if there is no such task.
     """
-    unsolved: set[str] = set()
-    solved: set[str] = set()
-    for policy in results:
-        for row in policy.rows:
-            if row.source == "libero" and row.number == 0:
-                (solved if row.success else unsolved).add(row.base)
-    if unsolved <= solved:
+    rows_of_policies = chain.from_iterable(policy.rows for policy in results)
+    first_states = [row for row in rows_of_policies if row.source == "libero" and row.number == 0]
+    solved = {row.base for row in first_states if row.success}
+    if solved == {row.base for row in first_states}:
         return []
     arms = arms_of(results)
     rows = [["tests", "episodes", *arms]]

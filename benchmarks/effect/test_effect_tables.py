@@ -88,6 +88,20 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     assert "| nothing | stove 2 of 2 | stove 2 of 2 |" in text
 
 
+def test_a_task_whose_first_state_no_policy_solves_is_left_out_of_a_table() -> None:
+    def of_arm(arm: str, solves_camera: bool) -> results.PolicyResults:
+        stove = [row("clean", 0, True, arm), *(row("camera", number, solves_camera, arm) for number in range(2))]
+        bowl = [row("clean", 0, False, arm), *(row("camera", number, False, arm) for number in range(2))]
+        rows = [*stove, *(replace(one, base="bowl", name=f"{one.name} bowl") for one in bowl)]
+        return replace(of_policy(arm, 0, 0), rows=rows)
+
+    text = comparison.markdown([of_arm("clean", False), of_arm("ours", True)])
+    assert "| camera, noise | 4 | 0 % | 50 % |" in text
+    assert "whose first state a policy solves unperturbed" in text
+    assert "| camera | 2 | 0 % | 100 % |" in text
+    assert "solves unperturbed" not in comparison.markdown([of_policy("clean", 0, 4)])
+
+
 def test_camera_and_noise_have_lines_of_their_own_next_to_held_out_perturbations() -> None:
     policy = of_policy("ours", 0, 4)
     light = row("light", 0, True, "ours0")

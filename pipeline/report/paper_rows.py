@@ -52,7 +52,7 @@ class Row(NamedTuple):
         rates: heading to the rate in percent; `None` if it was not measured.
         intervals: heading to the bounds of the 95 % interval in percent, of measured rates.
         partial: headings whose rate leaves out a part of the benchmark.
-        sampled: other headings whose rate is an estimate from some of the test tasks.
+        sampled: heading of any other estimate from some of the test tasks, to their number in words.
         tasks_run: heading of a column, or ``total``, to the number of test tasks with an episode.
         absent: column to the left-out parts.
     """
@@ -99,12 +99,12 @@ def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
     tasks_run = {column: cells[column]["tasks"] if column in cells else 0 for column in DIMENSIONS}
     partial = frozenset([*absent, "total", "mean of seven"] if absent else ())
     counts = {**tasks_run, "total": sum(tasks_run.values())}
+    whole = {**sizes, "total": sum(sizes.values())}
     sampled: dict[str, str] = {}
-    for column in measured.keys() - partial:
-        of_column = column if column in counts else "total"
-        whole = sizes.get(of_column, sum(sizes.values()))
-        if counts[of_column] < whole:
-            sampled[column] = f"{counts[of_column]:,} of {whole:,}"
+    for heading in COLUMNS:
+        counted = heading if heading in counts else "total"  # The mean of seven is over all tasks, too.
+        if heading in measured and heading not in partial and counts[counted] < whole[counted]:
+            sampled[heading] = f"{counts[counted]:,} of {whole[counted]:,}"
     fewest, most = protocol["trials"]
     return Row(
         name=row["name"],
@@ -121,7 +121,7 @@ def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
             heading: (_percent(estimate["low"]), _percent(estimate["high"])) for heading, estimate in measured.items()
         },
         partial=partial,
-        sampled={heading: sampled[heading] for heading in COLUMNS if heading in sampled},
+        sampled=sampled,
         tasks_run=counts,
         absent=absent,
     )

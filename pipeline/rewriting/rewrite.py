@@ -99,7 +99,7 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     task_brief = brief(bddl_file)
     bank = read_bank(out) if out.exists() else {}
     task: Task = task_brief["task"]
-    stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
+    stored = _stored(bank, task)
     _check_stored(stored, task, out)
     shipped = load_bank().get(task.suite, {}).get(task.name, {})
     taken: set[str] = set()
@@ -214,10 +214,15 @@ def tidy(text: str) -> str:
     return plain.strip("\"'`, \N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}").rstrip(".!? ")
 
 
+def _stored(bank: Bank, task: Task) -> dict[Component, tuple[str, ...]]:
+    """Return each class to a task's rewrites in a bank."""
+    return {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
+
+
 def _add(accepted: Sequence[str], component: Component, task: Task, path: Path) -> None:
     """Add rewrites to the bank in ``path``, which a person or another command may have changed meanwhile."""
     bank = read_bank(path) if path.exists() else {}
-    stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
+    stored = _stored(bank, task)
     stored[component] = (*stored[component], *accepted)
     bank.setdefault(task.suite, {})[task.name] = stored
     _write(bank, path)
