@@ -184,12 +184,17 @@ def objects_of(perturbation: dict[str, Any]) -> set[str]:
     return {added["category"] for added in perturbation.get("objects", ())}
 
 
-def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:
-    """Names of episodes are equal, and so are their numbers in both perturbed arms and in all tasks."""
-    runs = {arm: load(EFFECT / "gpu" / f"{arm}.yaml") for arm in shipped.arms}
-    assert {arm: tuple(run.plan.episodes) for arm, run in runs.items()} == shipped.arms
-    assert {sum(run.plan.episodes.values()) for arm, run in runs.items() if shipped.arms[arm]} == {2560}
-    assert all(count % 40 == 0 for run in runs.values() for count in run.plan.episodes.values())
+def test_the_arms_for_gpus_are_those_of_the_table(shipped: Experiment) -> None:
+    """Both perturbed arms have 2,560 perturbed episodes, in the proportions of the experiment."""
+    axes = read(EFFECT / "further" / "axes.yaml")
+    arms = ("clean", "released", "all")
+    runs = {arm: load(EFFECT / "gpu" / f"{arm}.yaml") for arm in arms}
+    assert {arm: tuple(run.plan.episodes) for arm, run in runs.items()} == {arm: axes.arms[arm] for arm in arms}
+    assert {sum(run.plan.episodes.values()) for arm, run in runs.items() if axes.arms[arm]} == {2560}
+    for arm, run in runs.items():
+        for axes_of_mixture, count in run.plan.episodes.items():
+            share = axes.run.plan.episodes[axes_of_mixture] / planned_perturbed(axes, arm)
+            assert count == pytest.approx(2560 * share, abs=1)
     assert len({run.demos.root for run in runs.values()}) == 1 < len({run.data for run in runs.values()})
 
 
@@ -491,7 +496,7 @@ def test_from_demonstrations_to_the_results(
     assert found.black == [{"task": STOVE.name, "state": 0, "success": False}]
     assert found.made["episodes_by_axis"] == {"clean": 1, "noise": 1}
     (dataset,) = Path("data/effect/datasets").glob("more_*.npz")
-    assert (found.made["demonstrations"], found.made["frames"]) == (2, len(np.load(dataset)["action"]))
+    assert (found.made["demonstrations"], found.made["frames"]) == (1, len(np.load(dataset)["action"]))
     assert found.made["trained_with"]["packages"] == found.made["packages"]
     (clean,), (more,) = (list(Path("data/effect/datasets").glob(f"{arm}_*/")) for arm in ("clean", "more"))
     files = {file.relative_to(clean) for file in clean.glob("*/**/*.npz")}

@@ -87,13 +87,14 @@ def test_rlds_refuses_a_bad_episode(fault: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_lerobot_refuses_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) -> None:
-    (tmp_path / "lerobot").mkdir()
-    (tmp_path / "lerobot" / "earlier").write_text("set")
+    write_lerobot(tmp_path, frames="images")
+    earlier = files(tmp_path / "lerobot")
     field, spoil = BAD["nan"]
     with pytest.raises(PipelineError, match=rf"episode {IDS[-1]}: {field} "):
         write_lerobot(tmp_path, load=partial(load_spoilt, spoil=spoil))
-    assert files(tmp_path / "lerobot") == {"earlier": b"set"}
+    assert files(tmp_path / "lerobot") == earlier
     # Of the three pieces the two that are whole stay, for the next time.
     assert [path.name for path in sorted((tmp_path / ".work").rglob("0000*"))] == ["00000", "00001"]
     write_lerobot(tmp_path)
+    assert files(tmp_path / "lerobot") != earlier
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lerobot", "lerobot.json"]
