@@ -25,6 +25,8 @@ from pipeline.catalogue.data_maps import DATA_MAPS
 from pipeline.catalogue.procedural import COLOUR_MAPS
 from pipeline.catalogue.texture_sources import Source, Texture, keep
 from pipeline.errors import PipelineError
+from pipeline.libero import bddl
+from pipeline.libero.arenas import Arena
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Frame, Task
@@ -48,6 +50,16 @@ MATERIALS: dict[Part, dict[str, int]] = {
 A new texture is repeated by the given number across the material's own texture. The top of a modelled table is only a
 small piece of its unfolded skin."""
 
+ABSENT_PARTS: dict[Arena, frozenset[Part]] = {
+    "tabletop": frozenset({"cupboard"}),
+    "kitchen": frozenset(),
+    "living_room": frozenset({"cupboard"}),
+    "study": frozenset({"cupboard"}),
+    # A floor that is worked on is the surface.
+    "floor": frozenset({"cupboard", "floor"}),
+}
+"""Parts that an arena does not show."""
+
 PARTS: dict[Component, tuple[Part, ...]] = {"theme": ("wall", "floor", "cupboard", "surface"), "surface": ("surface",)}
 """Parts that a perturbation names a texture for. Every theme test of LIBERO-Plus names one for a wall and one for the
 working surface."""
@@ -63,7 +75,7 @@ class Covering(Frozen):
     """Texture on one part of the scene.
 
     Attributes:
-        part: covered part; a part that the scene does not have is left out. A floor that is worked on is the surface.
+        part: covered part. Not every scene shows it (``BackgroundPerturbation.shown``).
         texture: name in the sources of :mod:`pipeline.catalogue.textures`.
         licence: licence that the texture's source states.
         sha256: hash of the texture.
@@ -136,9 +148,14 @@ class BackgroundPerturbation(RenderPerturbation):
         """Hashes of the textures."""
         return {covering.sha256 for covering in self.coverings}
 
-    def credits(self) -> frozenset[Credit]:
-        """List the textures with their licences."""
-        return frozenset(Credit(c.texture, "texture", c.licence, c.author) for c in self.coverings)
+    def shown(self, task: Task) -> tuple[Covering, ...]:
+        """Return the coverings of the parts that the scene of a task has."""
+        absent = ABSENT_PARTS[bddl.read(task.bddl_file).arena]
+        return tuple(covering for covering in self.coverings if covering.part not in absent)
+
+    def credits(self, task: Task) -> frozenset[Credit]:
+        """List the textures that the scene of ``task`` shows, with their licences."""
+        return frozenset(Credit(c.texture, "texture", c.licence, c.author) for c in self.shown(task))
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Measure the changed share of each view."""
@@ -234,7 +251,7 @@ class BackgroundAxis(Axis):
         """Describe a plot of the images by source and family."""
         names: list[str] = []
         for item in kept:
-            names += [covering.texture for covering in item.perturbation.coverings]
+            names += [covering.texture for covering in item.perturbation.shown(item.task)]
         tested = test.on_axis("background")
         images = set()
         for task in tested:

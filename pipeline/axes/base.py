@@ -157,8 +157,8 @@ class Perturbation(Frozen):
         """
         return False
 
-    def credits(self) -> frozenset[Credit]:
-        """List the shown textures and objects that have a licence of their own."""
+    def credits(self, task: Task) -> frozenset[Credit]:
+        """List the textures and objects that an episode of ``task`` shows and that have a licence of their own."""
         return frozenset()
 
     @property

@@ -29,7 +29,7 @@ from pipeline.axes.base import (
 from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation, Scatter, Strips
 from pipeline.errors import PipelineError
 from pipeline.rotations import about, product, rotate
-from pipeline.testset.benchmark import TESTED_SUITES, TestSet, TestTask
+from pipeline.testset.benchmark import TestSet, TestTask, is_in_tested_scene
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -114,9 +114,9 @@ class CameraPerturbation(RenderPerturbation):
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the test cameras of all tasks, because many tasks share one nominal view.
 
-        They are NaN for a task of a suite without test tasks: LIBERO-90's and the user's own.
+        They are NaN for a task in a scene without test tasks, as some of LIBERO-90's and of the user's own are.
         """
-        if task.suite not in TESTED_SUITES:
+        if not is_in_tested_scene(task):
             return np.full(len(test.on_axis(self.axis)), np.nan)
         cameras, places = _test_cameras(test)
         return self._angles_deg(cameras)[places]
@@ -313,7 +313,7 @@ class CameraAxis(Axis):
         distance: Ranges of the component ``distance``.
         spherical: Ranges of the component ``spherical``.
         orientation: Ranges of the component ``orientation``.
-        clear_by: Method that keeps the cameras of the four tested suites at their clearance from the test cameras.
+        clear_by: Method that keeps cameras in scenes of the four tested suites at their clearance from test cameras.
             ``second_change``, the default, also changes a second one of ``components``, within its ranges. ``resample``
             only samples again, and needs ranges that no test camera occupies. ``off`` keeps no clearance:
             ``leakage.json`` counts the overlaps, and the run continues.
@@ -402,7 +402,7 @@ class CameraAxis(Axis):
     def _draw(self, rng: np.random.Generator, component: Component, level: Level, task: Task) -> CameraPerturbation:
         """Sample a perturbation of a component at a level."""
         drawn = self._draw_parameters(rng, component, level)
-        if self.clear_by == "second_change" and task.suite in TESTED_SUITES:
+        if self.clear_by == "second_change" and is_in_tested_scene(task):
             drawn |= self._draw_second_change(rng, component)
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
 

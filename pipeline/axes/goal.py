@@ -18,10 +18,11 @@ from pipeline import seeding
 from pipeline.axes.base import LEVELS, Axis, Level, PhysicsPerturbation
 from pipeline.axes.language_goal import lost_demands
 from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Strips
+from pipeline.files import checksum
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
 from pipeline.libero.carried import CannotCarryError, carried, definition_of
-from pipeline.libero.tasks import find_task, tasks
+from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, RollOut, Scene, Task
 
@@ -121,12 +122,15 @@ class GoalPerturbation(PhysicsPerturbation):
     Attributes:
         scene: name of the first task of LIBERO's list that begins in the scene.
         start: number of the reset; episodes of one scene with equal numbers begin with the same picture.
+        scene_sha256: SHA-256 of the scene's file in a suite of the user, so that an edited scene gives other episodes;
+            empty for LIBERO's suites.
     """
 
     axis: Literal["goal"] = "goal"
     component: Literal["other_scene"] = "other_scene"
     scene: str
     start: Annotated[int, Field(ge=0)]
+    scene_sha256: str = Field(default="", exclude_if=lambda sha256: not sha256)
 
     def played(self, task: Task) -> Task:
         """Return ``task`` in the other scene."""
@@ -147,7 +151,8 @@ class GoalAxis(Axis):
     """Tasks in all scenes of their suite in which their instruction means one thing; a fifth of these is held out.
 
     Attributes:
-        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        levels: Levels of the scenes to use, 1 (weak) to 5 (strong); all five by default. Each scene has equal
+            probability, and repeated entries have no effect.
         starts: Number of different resets of each scene; all tasks that are carried to a scene share them; 10 by
             default.
     """
@@ -174,7 +179,8 @@ class GoalAxis(Axis):
         scenes = self.entries(task)
         scene = find_task(task.suite, scenes[place % len(scenes)])
         start = int(rng.integers(self.starts))
-        return GoalPerturbation(scene=scene.name, start=start, level=level(task, scene))
+        sha256 = "" if scene.suite in SUITES else checksum(scene.bddl_file)
+        return GoalPerturbation(scene=scene.name, start=start, level=level(task, scene), scene_sha256=sha256)
 
     @classmethod
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[GoalPerturbation]], test: TestSet) -> CoveragePlots:

@@ -101,7 +101,7 @@ class LayoutPerturbation(PhysicsPerturbation):
         """Return infinity if no added object has one of ``categories``, else 0."""
         return math.inf if self._categories.isdisjoint(categories) else 0.0
 
-    def credits(self) -> frozenset[Credit]:
+    def credits(self, task: Task) -> frozenset[Credit]:
         """List the added objects with their licences."""
         return frozenset(Credit(o.name, "object", o.licence, o.attribution) for o in self.objects)
 

@@ -331,7 +331,8 @@ def _benchmark_places_m(task: Task) -> Shifts:
 def _disk_m(task: Task) -> float:
     """Return the radius of a task's disks at level 1."""
     for scene, radius_m in WIDER_M.items():
-        if task.name.startswith(scene):
+        # A carried task begins in the scene of another task's file.
+        if task.bddl_file.stem.startswith(scene):
             return radius_m
     return STEP_M.get(task.suite, 0.01)
 

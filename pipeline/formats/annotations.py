@@ -94,10 +94,10 @@ def event_annotations(episode: Episode, size_px: int) -> list[Annotation]:
 
 
 def _motion(episode: Episode, step: int) -> str:
-    """Describe the movement of the gripper in the ``MOTION_STEPS`` from a step on, as the robot sees it.
+    """Describe the movement of the gripper in the ``MOTION_STEPS`` from a step on, in words of LIBERO's instructions.
 
-    The robot of every arena looks along the world's x axis: forward is +x, left +y and up +z. Turns are seen from
-    above.
+    Their left is -y: the robot's right. Forward is +x, the direction in which the robot of every arena looks. Turns are
+    seen from above.
     """
     last = min(step + MOTION_STEPS, len(episode) - 1)
     words = _direction(episode.state[last, :3] - episode.state[step, :3])
@@ -116,7 +116,7 @@ def _motion(episode: Episode, step: int) -> str:
 
 def _direction(moved_m: NDArray[np.float32]) -> str:
     """Name the directions of a displacement (3,), the largest one first; empty if it is too small."""
-    names = (("forward", "backward"), ("left", "right"), ("up", "down"))
+    names = (("forward", "backward"), ("right", "left"), ("up", "down"))
     words = []
     for axis in np.argsort(-np.abs(moved_m), kind="stable"):
         if abs(moved_m[axis]) >= LEAST_M:

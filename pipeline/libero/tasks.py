@@ -19,8 +19,8 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
 """Largest number of control steps after settling, as in OpenVLA and LIBERO-Plus; longer episodes have failed."""
 
-Same = Literal["task", "scene"]
-"""Common part of two changes: the LIBERO task, or the scene that their tasks begin in."""
+Same = Literal["task", "instruction", "scene"]
+"""Common part of two changes: the LIBERO task, its instruction, or the scene that their tasks begin in."""
 
 _OF_FILES = ("scene", "suite", "libero", "bddl", "benchmark", "hdf", "demo")
 _DEBRIS = re.compile(rf"[_\d/\\]|\b({'|'.join(_OF_FILES)})\b", re.IGNORECASE)
@@ -171,7 +171,13 @@ def exceeds_step_limit(suite: str, steps: int) -> bool | None:
 
 def shared(task: Task, same: Same) -> Hashable:
     """Return a key that is equal for tasks that have the part ``same`` in common."""
-    return (task.suite, task.name) if same == "task" else bddl.read(task.bddl_file).scene
+    match same:
+        case "task":
+            return task.suite, task.name
+        case "instruction":
+            return task.instruction
+        case "scene":
+            return bddl.read(task.bddl_file).scene
 
 
 def select_tasks(patterns: Iterable[str]) -> list[Task]:

@@ -12,7 +12,7 @@ import jinja2
 import yaml
 from huggingface_hub import DatasetCardData
 
-from pipeline.axes import from_json
+from pipeline.axes import from_json, task_of
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.catalogue import texture_sources
@@ -125,7 +125,7 @@ def render(
     """
     distances, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
-    owed = attributions(row["perturbations"] for row in kept)
+    owed = attributions(kept)
     kept_suites = named(kept, "suite")
     own_suites = [suite for suite in kept_suites if suite not in SUITES]
     own_rewrites = _own_rewrites(kept)
@@ -179,15 +179,16 @@ def render(
     )
 
 
-def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
+def attributions(rows: Iterable[Mapping[str, Any]]) -> dict[Credit, int]:
     """Count the episodes that show each third-party work, sorted by kind and name.
 
     Args:
-        perturbations: for each episode, the column of that name in the plan or the manifest.
+        rows: suite, task and perturbations of each episode, as in the plan or the manifest.
     """
     counts: Counter[Credit] = Counter()
-    for text in perturbations:
-        credits = [perturbation.credits() for perturbation in from_json(text)]
+    for row in rows:
+        task = task_of(row["suite"], row["task"], row["perturbations"])
+        credits = [perturbation.credits(task) for perturbation in from_json(row["perturbations"])]
         counts.update({*chain(*credits)})
     return dict(sorted(counts.items(), key=lambda item: (item[0].kind, *item[0])))
 

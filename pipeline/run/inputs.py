@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pipeline.config import Config
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum
-from pipeline.libero.tasks import OWN, SUITES, select_tasks
+from pipeline.libero.tasks import OWN, SUITES, select_tasks, tasks
 from pipeline.run.finished import host, settings_of
 
 HASHED_BYTES = 16_000_000
@@ -37,9 +37,12 @@ def listing(config: Config) -> dict[str, list[str | int]]:
     for field, path in _paths(sections):
         for file in sorted(_files(path)):
             states[(PurePosixPath(field) / file.relative_to(path)).as_posix()] = _state(file)
-    for task in select_tasks(config.demos.tasks):
-        if task.suite not in SUITES:
-            states[f"{OWN}/{task}.bddl"] = _state(task.bddl_file)
+    own_tasks = [task for task in select_tasks(config.demos.tasks) if task.suite not in SUITES]
+    if config.plan.axes.goal:
+        # The axis carries tasks to the scenes of all tasks of their suite.
+        own_tasks = [task for suite in dict.fromkeys(task.suite for task in own_tasks) for task in tasks(suite)]
+    for task in own_tasks:
+        states[f"{OWN}/{task}.bddl"] = _state(task.bddl_file)
     return states
 
 

@@ -13,7 +13,7 @@ from pipeline.catalogue import downloads
 from pipeline.catalogue.downloads import Wheel
 from pipeline.errors import PipelineError
 from pipeline.grouping import grouped
-from pipeline.libero.tasks import Same, find_task, shared
+from pipeline.libero.tasks import Same, find_task, shared, tasks
 from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
 
@@ -100,8 +100,19 @@ class TestSet:
 @cache
 def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
     """Group the indices of an axis's test tasks by the ``shared`` key of the task that they perturb."""
-    tasks = [find_task(test_task.suite, test_task.base) for test_task in test.on_axis(axis)]
-    return grouped((shared(task, same), place) for place, task in enumerate(tasks))
+    bases = [find_task(test_task.suite, test_task.base) for test_task in test.on_axis(axis)]
+    return grouped((shared(task, same), place) for place, task in enumerate(bases))
+
+
+@cache
+def is_in_tested_scene(task: Task) -> bool:
+    """Return whether a task begins in a scene of a tested suite, as 35 tasks of LIBERO-90 do."""
+    return task.suite in TESTED_SUITES or shared(task, "scene") in _tested_scenes()
+
+
+@cache
+def _tested_scenes() -> frozenset[Hashable]:
+    return frozenset(shared(task, "scene") for suite in TESTED_SUITES for task in tasks(suite))
 
 
 @cache

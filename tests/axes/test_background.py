@@ -12,7 +12,7 @@ from arenas import TASKS, change, changed, checksums, frames
 from conftest import MILK, REPOSITORY
 
 from pipeline.axes import RenderPerturbation
-from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering
+from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering, skin_of
 from pipeline.axes.base import Level
 from pipeline.catalogue import procedural
 from pipeline.catalogue.data_maps import DATA_MAPS
@@ -63,11 +63,16 @@ def test_only_the_named_surfaces_change_and_all_comes_back(shown: Renderer, requ
     arena = request.node.callspec.params["shown"]
     before, clean, textures = checksums(shown), frames(shown), texture_bytes(shown)
     for component in PARTS:
-        with shown.perturbed([drawn(component, 5, arena)]):
+        perturbation = drawn(component, 5, arena)
+        with shown.perturbed([perturbation]):
             assert changed(before, checksums(shown)) == {"tex_data"}
             replaced = {shown.model.texture(i).name for i, now in enumerate(texture_bytes(shown)) if now != textures[i]}
             assert replaced == (THEMES[arena] if component == "theme" else {worked_on(shown)})
             assert worked_on(shown) in replaced
+            visible = perturbation.shown(TASKS[arena])
+            assert len(visible) == len(replaced)
+            parts = [(place, skin) for place in visible if (skin := skin_of(shown.model, place.part))]
+            assert {shown.model.texture(skin.texture).name for _, skin in parts} == replaced
             after = frames(shown)
         assert change(clean["agentview"], after["agentview"]) > 1
         assert change(clean["robot0_eye_in_hand"], after["robot0_eye_in_hand"]) > 3

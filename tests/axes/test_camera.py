@@ -1,6 +1,7 @@
 """Camera: the benchmark's own formulas, by an independent implementation, and clear of its test cameras."""
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 
@@ -14,13 +15,13 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from pipeline.axes import from_json, to_json
-from pipeline.axes.camera import CameraAxis, CameraPerturbation
+from pipeline.axes.camera import PARAMETERS, CameraAxis, CameraPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import tasks
 from pipeline.planning import leakage
 from pipeline.seeding import rng
-from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.testset.benchmark import TESTED_SUITES, TestSet, TestTask
 from pipeline.types import Task
 
 OF_LIBERO_90 = tasks("libero_90")[0]
@@ -207,6 +208,28 @@ def test_only_tasks_of_tested_suites_get_a_second_change(test_set: TestSet) -> N
         parts = (p.azimuth_deg or p.elevation_deg, p.distance_scale - 1, p.yaw_deg or p.pitch_deg)
         assert sum(part != 0 for part in parts) == 1, p
         assert p.nearest(test_set, OF_LIBERO_90) == (np.inf, 0)
+
+
+def test_a_task_of_libero_90_in_a_tested_scene_keeps_its_clearance(test_set: TestSet) -> None:
+    """Scenes are compared by the text of LIBERO's files: four sections that have no goal and no instruction."""
+
+    def scene(task: Task) -> tuple[str, ...]:
+        sections = re.split(r"\n  (?=\(:\w+)", task.bddl_file.read_text().replace("    (:", "  (:"))
+        texts = [
+            section for section in sections if section.startswith(("(:regions", "(:fixtures", "(:objects", "(:init"))
+        ]
+        return tuple(re.sub(r"\s+", " ", text) for text in texts)
+
+    tested = {scene(task) for suite in TESTED_SUITES for task in tasks(suite)}
+    alike = [task for task in tasks("libero_90") if scene(task) in tested]
+    assert len(alike) == 35
+    for task in alike:
+        planted = test_set.tasks[0]
+        parameters = {name: planted.parameters[name] for name in PARAMETERS}
+        same = CameraPerturbation.model_validate({"component": planted.component, "level": 1, **parameters})
+        assert same.nearest(test_set, task).distance == pytest.approx(0, abs=1e-5)
+        found = [p.nearest(test_set, task).distance for p in draws(CameraAxis(), task=task)[:20]]
+        assert np.mean(np.array(found) >= CameraPerturbation.clearance) > 0.7
 
 
 def test_ranges_without_a_clear_camera_are_rejected(test_set: TestSet) -> None:

@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 from conftest import starter_demo
 
-from pipeline.axes import Axes, from_json, task_of
+from pipeline.axes import Axes, from_json, task_of, to_json
 from pipeline.axes.goal import GoalAxis, GoalPerturbation, held_out, level, pairs, usable
-from pipeline.axes.language import LanguageAxis, LanguagePerturbation
+from pipeline.axes.language import LanguageAxis, LanguagePerturbation, load_bank
 from pipeline.axes.language_goal import changed_goal
 from pipeline.axes.pose import PoseAxis, ScenePerturbation
-from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
+from pipeline.config import Config, DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import bddl
 from pipeline.libero.carried import CannotCarryError, bddl_text, carried, definition_of
+from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.physics.environment import Environment
 from pipeline.planning import plan
+from pipeline.run import inputs
 from pipeline.run.replay_job import ReplayJob
 from pipeline.seeding import rng
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TESTED_SUITES
 
 PICK, PLATE = "pick_up_the_", "_and_place_it_on_the_plate"
 BASKET = "_and_place_it_in_the_basket"
@@ -212,6 +215,63 @@ def test_a_rewrite_that_means_two_things_of_the_scene_is_left_out() -> None:
         assert len(there) > 10
         left_out += len(own - there)
     assert left_out > 0
+
+
+def test_beside_the_axis_goal_every_rewrite_names_its_things() -> None:
+    """A description such as this one holds in the task's own scene, which has no milk."""
+    riddle, test = "find the only thing here that you would pour into a glass and drink", benchmark.load()
+    juice = find_task("libero_object", f"{PICK}orange_juice{BASKET}")
+    assert any(riddle in text for text in LanguageAxis().wordings(juice, (), test))
+    for suite in TESTED_SUITES:
+        for pair in usable(suite):
+            bank = load_bank()[pair.task.suite][pair.task.name]
+            named = {text for component in ("distraction", "paraphrase") for text in bank[component]}
+            wordings = LanguageAxis().wordings(pair.played, ("goal",), test)
+            assert {*wordings, *LanguageAxis().beside(("goal", "language")).entries(pair.played)} <= named
+            assert len(wordings) > 10
+
+
+def test_an_edited_scene_of_an_own_suite_gives_other_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A region of one file grows by 5 mm, and the milk is carried there. LIBERO's scenes have no sum."""
+    names = ("alphabet_soup", "cream_cheese", "milk")
+    source = {name: find_task("libero_object", f"{PICK}{name}{BASKET}") for name in names}
+    plan_of_run = PlanConfig.model_validate({"episodes": {"goal": 4}})
+    found = []
+    for folder in ("before", "after"):
+        own = tmp_path / folder / "tasks" / "kitchen"
+        own.mkdir(parents=True)
+        for name, task in source.items():
+            text = task.bddl_file.read_text()
+            edited = text.replace("(-0.145 -0.265 -0.095 -0.215)", "(-0.145 -0.265 -0.095 -0.210)")
+            assert edited != text
+            (own / f"pack_{name}.bddl").write_text(text if folder == "before" or name == "milk" else edited)
+        monkeypatch.chdir(tmp_path / folder)
+        for cached in (pairs, held_out):
+            cached.cache_clear()
+        task = find_task("kitchen", "pack_milk")
+        entry = DemoEntry(task, "demo_0", "recorded", "human", "a" * 64, 100)
+        made = GoalAxis().sample(rng("own"), task, 0)
+        row = plan.row(entry, [made], 0, ReplayConfig())
+        config = {"name": "own", "demos": {"root": "demos", "tasks": [str(task)]}, "plan": plan_of_run}
+        listed = inputs.listing(Config.model_validate(config))
+        found.append((row.episode_id, row.trajectory_id, listed[f"tasks/kitchen/{made.scene}.bddl"]))
+    for before, after in zip(*found, strict=True):
+        assert before != after
+    of_libero = GoalAxis().sample(rng("own"), source["milk"], 0)
+    assert "scene_sha256" not in to_json([of_libero])
+
+
+def test_disks_of_a_carried_task_are_those_of_its_scene() -> None:
+    """LIBERO-Plus's disks are twice as wide in the first scene of the living room."""
+    first, second = (next(task for task in tasks("libero_10") if f"ROOM_SCENE{k}_" in task.name) for k in (1, 2))
+    for task, scene in ((first, second), (second, first)):
+        farthest_m = {}
+        for played in (scene, carried(task, scene)):
+            sampled = [PoseAxis(components=("scene",), levels=(1,)).sample(rng("t", k), played, k) for k in range(200)]
+            moves = [move for one in sampled if isinstance(one, ScenePerturbation) for move in one.moves]
+            farthest_m[played.name] = max(float(np.hypot(move.dx_m, move.dy_m)) for move in moves)
+        assert farthest_m[task.name] == pytest.approx(farthest_m[scene.name], rel=0.2)
+        assert farthest_m[scene.name] == pytest.approx(0.02 if scene is first else 0.01, rel=0.2)
 
 
 @pytest.mark.slow

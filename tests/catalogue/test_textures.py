@@ -139,7 +139,7 @@ def test_a_folder_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     # What was drawn is shown, whatever becomes of the folder.
     sources = (Folder(folder=folder, licence="CC-BY-4.0", author="Jane Doe"),)
     drawn = BackgroundAxis(sources=sources).sample(rng("oak"), STOVE, 0)
-    assert drawn.credits() == {Credit(texture.name, "texture", "CC-BY-4.0", "Jane Doe")}
+    assert drawn.credits(STOVE) == {Credit(texture.name, "texture", "CC-BY-4.0", "Jane Doe")}
     assert from_json(to_json([drawn])) == (drawn,)
     oak.unlink()
     assert pixels(texture.name, texture.sha256)[0, 0].tolist() == [200, 20, 10]

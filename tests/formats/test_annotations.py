@@ -1,6 +1,7 @@
 """Motions and traces against movements and cameras whose words and pixels are known."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import IDS, episode
 
 from pipeline.formats.annotations import event_annotations, persistent_annotations
+from pipeline.libero.assets import libero_folder
 from pipeline.types import Episode, Geometry
 
 INTRINSICS = np.array([[100, 0, 128], [0, 100, 128], [0, 0, 1]], np.float32)
@@ -44,9 +46,9 @@ OPEN, CLOSED = np.full(20, -1, np.float32), np.full(20, 1, np.float32)
     [
         ((5, 0, 0), (0, 0, 0), OPEN, [(0, "move forward")]),
         ((-5, 0, 0), (0, 0, 0), OPEN, [(0, "move backward")]),
-        ((0, 5, 0), (0, 0, 0), OPEN, [(0, "move left")]),
-        ((0, -5, 0), (0, 0, 0), CLOSED, [(0, "move right")]),
-        ((2, 3, -4), (0, 0, 0), OPEN, [(0, "move down and left and forward")]),
+        ((0, 5, 0), (0, 0, 0), OPEN, [(0, "move right")]),
+        ((0, -5, 0), (0, 0, 0), CLOSED, [(0, "move left")]),
+        ((2, 3, -4), (0, 0, 0), OPEN, [(0, "move down and right and forward")]),
         ((0.9, 0, 0.5), (0, 0, 0), OPEN, [(0, "stay")]),
         ((0, 0, 0), (0, 0, 2), OPEN, [(0, "turn counterclockwise")]),
         ((0, 0, 0), (0, 0, -2), OPEN, [(0, "turn clockwise")]),
@@ -67,6 +69,22 @@ def test_a_movement_is_in_words(
 ) -> None:
     x, y, z = step_mm
     assert motions(moving((x / 1000, y / 1000, z / 1000), turn_deg, grip)) == expected
+
+
+def test_left_is_the_left_of_libero_s_instructions() -> None:
+    """LIBERO's own files place each thing that a name calls left or right: 52 pairs of regions."""
+    places = re.compile(r"\((\w+)_(left|right)(\w*_region)\s+\(:target \w+\)\s+\(:ranges \(\s*\(([-.\d ]+)\)")
+    pairs: list[tuple[float, float]] = []
+    for file in sorted((libero_folder() / "bddl_files").glob("libero_*/*.bddl")):
+        middle_m: dict[tuple[str, str], dict[str, float]] = {}
+        for name, side, rest, numbers in places.findall(file.read_text()):
+            _, low_m, _, high_m = map(float, numbers.split())
+            middle_m.setdefault((name, rest), {})[side] = (low_m + high_m) / 2
+        pairs += [(sides["left"], sides["right"]) for sides in middle_m.values() if len(sides) == 2]
+    assert len(pairs) == 52
+    for left_m, right_m in pairs:
+        towards = (left_m - right_m) / 20
+        assert motions(moving((0.0, towards, 0.0), (0, 0, 0), OPEN)) == [(0, "move left")]
 
 
 def test_a_trace_is_where_the_gripper_goes_within_two_seconds() -> None:

@@ -149,19 +149,19 @@ def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
 
 
 def test_modality_names_columns_that_are_there(written: Written, tmp_path: Path) -> None:
-    """In both versions; starVLA's names, and GR00T's for the agent view."""
-    images = "observation.images"
-    for root, wrist in ((written.lerobot.root, "image2"), (write_lerobot_v21(tmp_path).folder / SET, "wrist_image")):
-        modality = json.loads((root / "meta" / "modality.json").read_text())
-        features = json.loads((root / "meta" / "info.json").read_text())["features"]
-        assert list(modality["state"]) == ["x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper"]
-        assert list(modality["action"]) == ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
-        for kind, width, column in (("state", 8, "observation.state"), ("action", 7, "action")):
-            spans = [(of["start"], of["end"]) for of in modality[kind].values()]
-            assert spans == [(k, k + 1) for k in range(width)]
-            assert {of["original_key"] for of in modality[kind].values()} == {column}
-        agent = f"{images}.image"
-        shown = {name: of["original_key"] for name, of in modality["video"].items()}
-        assert shown == {"primary_image": agent, "image": agent, "wrist_image": f"{images}.{wrist}"}
-        assert {"observation.state", "action", *shown.values()} <= set(features)
-        assert modality["annotation"] == {"human.action.task_description": {"original_key": "task_index"}}
+    """starVLA's names, and GR00T's for the agent view; only in the layout with the gripper that both expect."""
+    assert not (written.lerobot.root / "meta" / "modality.json").exists()
+    root = write_lerobot_v21(tmp_path).folder / SET
+    modality = json.loads((root / "meta" / "modality.json").read_text())
+    features = json.loads((root / "meta" / "info.json").read_text())["features"]
+    assert list(modality["state"]) == ["x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper"]
+    assert list(modality["action"]) == ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+    for kind, width, column in (("state", 8, "observation.state"), ("action", 7, "action")):
+        spans = [(of["start"], of["end"]) for of in modality[kind].values()]
+        assert spans == [(k, k + 1) for k in range(width)]
+        assert {of["original_key"] for of in modality[kind].values()} == {column}
+    agent, wrist = "observation.images.image", "observation.images.wrist_image"
+    shown = {name: of["original_key"] for name, of in modality["video"].items()}
+    assert shown == {"primary_image": agent, "image": agent, "wrist_image": wrist}
+    assert {"observation.state", "action", *shown.values()} <= set(features)
+    assert modality["annotation"] == {"human.action.task_description": {"original_key": "task_index"}}

@@ -5,19 +5,22 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import av
+import cv2
 import datasets
 import lerobot.datasets.aggregate
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from conftest import Once
-from every_set import Written, assert_lerobot_episodes, every_set, lerobot_index, pixels
+from every_set import Written, assert_lerobot_episodes, every_set, lerobot_index, pixels, psnr_db
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 from synthetic import IDS, MATRICES, REPO, episode, write_lerobot
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, Content
 from pipeline.formats import lerobot as lerobot_format
+from pipeline.formats.lerobot.write import Video
 
 
 @pytest.fixture(scope="module")
@@ -115,3 +118,18 @@ def test_lerobot_statistics_are_exact(written: Written) -> None:
         for row, shown in zip(pq.read_table(target.root / "meta" / "episodes").to_pylist(), frames, strict=True):
             of_episode = {name.rpartition("/")[2]: value for name, value in row.items() if "image/" in name}
             assert_statistics(of_episode, shown, (0, 1, 2))
+
+
+@pytest.mark.parametrize("size_px", [66, 98, 250, 256, 510])
+def test_a_video_shows_the_frames_of_each_permitted_size(size_px: int, tmp_path: Path) -> None:
+    """Frames of a coloured picture that is not symmetric, also of a size that is not a multiple of 4."""
+    picture = pixels(episode(IDS[0]).frames["image"][0])
+    source = np.asarray(cv2.resize(picture, (size_px, size_px), interpolation=cv2.INTER_AREA), np.uint8)
+    frames = [np.roll(source, 2 * shift, axis=1) for shift in range(3)]
+    with Video(tmp_path / "video.mp4", Content(size_px=size_px)) as video:
+        for frame in frames:
+            video.add(frame, first=frame is frames[0])
+    with av.open(str(tmp_path / "video.mp4")) as stored:
+        shown = [frame.to_ndarray(format="rgb24") for frame in stored.decode(video=0)]
+    assert [frame.shape for frame in shown] == [(size_px, size_px, 3)] * 3
+    assert min(map(psnr_db, shown, frames)) > 34, "with rows or colours displaced it is below 29"

@@ -151,7 +151,6 @@ def _format(
         yield Fault("lerobot", None, f"info.json describes the columns {unexpected}", "only columns of the data files")
     yield from _wrong_tasks("lerobot", tasks, [row["tasks"][0] for row in episodes.values()])
     yield from _wrong_splits(info["splits"], len(episodes), val)
-    yield from _wrong_modality("lerobot", root, info["features"], convention, content)
     yield from _wrong_files(root, episodes, convention, content)
     for file in sorted(root.glob("videos/**/*.mp4")):
         yield from _wrong_video("lerobot", file, info["features"][file.parent.parent.name]["info"])

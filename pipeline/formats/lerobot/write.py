@@ -118,7 +118,7 @@ class Video:
             pixels: the frame.
             first: True if it is the first frame of an episode.
         """
-        self._append(av.VideoFrame.from_numpy_buffer(planes(pixels), format=self.pixel_format), first)
+        self._append(av.VideoFrame.from_ndarray(planes(pixels), format=self.pixel_format), first)
 
     def _append(self, frame: av.VideoFrame, first: bool) -> None:
         frame.pts, frame.time_base = self.frames, Fraction(1, SCHEMA.fps_hz)
@@ -376,6 +376,8 @@ def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
 def _write_modality(root: Path, convention: Convention, content: Content) -> None:
     """Write ``meta/modality.json``, by which GR00T and starVLA find their inputs.
 
+    Both expect 1 for an open gripper and 0 for a closed one, so only datasets with this gripper have the file.
+
     Entries and names are those of ``examples/simBenchmarks/LIBERO/train_files/modality.json`` in starVLA/starVLA at
     0ed0aad. The agent view has a second entry ``image``, its name in NVIDIA/Isaac-GR00T at 23ace64
     (``gr00t/configs/data/embodiment_configs.py``), whose own file has both fingers as the gripper. Both projects call
@@ -478,7 +480,6 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
     numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
     table = pa.table(numbered).replace_schema_metadata({"pandas": INDEX})
     pq.write_table(table, root / "meta" / "tasks.parquet")
-    _write_modality(root, convention, content)
     splits: dict[str, tuple[int, int]] = {}  # Ranges of episodes, in the order of the pieces.
     for piece in pieces:
         first, _ = splits.get(piece.split, (piece.first_episode, 0))
@@ -601,7 +602,7 @@ def finish_v21(work: Path, root: Path, pieces: Sequence[Piece], convention: Conv
     tasks = _write_common(work, root, pieces, convention, content)
     rows = [{"task_index": number, "task": task} for task, number in tasks.items()]
     (root / "meta" / "tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    if convention.open_is_one:  # The readers of modality.json expect this gripper.
+    if convention.open_is_one:
         _write_modality(root, convention, content)
     totals = _totals("v2.1", pieces[-1], len(tasks), convention)
     episodes, videos = totals["total_episodes"], convention.frames == "video"
