@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -331,7 +332,9 @@ class Config(Frozen):
         chosen = [str(task) for task in select_tasks(self.demos.tasks)]
         for name in self.plan.task_weights:
             if name not in chosen:
-                raise ValueError(f"plan.task_weights: demos.tasks does not select {name!r}; expected <suite>/<task>")
+                similar = get_close_matches(name, chosen, n=1)
+                expected = f"did you mean {similar[0]}?" if similar else "expected <suite>/<task>"
+                raise ValueError(f"plan.task_weights: demos.tasks does not select {name!r}; {expected}")
         return self
 
     @model_validator(mode="after")
@@ -448,10 +451,25 @@ def read_content(path: Path) -> Any:
     """
     try:
         return yaml.load(path.read_text(encoding="utf-8"), StrictLoader)
-    except (OSError, UnicodeDecodeError) as error:
-        files = sorted(map(str, Path("configs").glob("*")))
+    except FileNotFoundError as error:
+        files = [file.as_posix() for file in sorted(Path("configs").glob("*.yaml"))]
+        similar = get_close_matches(path.as_posix(), files, n=1)
         raise PipelineError(
-            f"cannot read the configuration ({error})", where=path, remedy=f"name one of {files}"
+            "there is no such configuration",
+            where=path,
+            expected=f"did you mean {similar[0]}?" if similar else f"a file such as {', '.join(files)}",
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise PipelineError(
+            f"cannot read the configuration ({error})", where=path, expected="a text file in UTF-8"
+        ) from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f" in line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise PipelineError(
+            f"the file is not valid YAML{place}: {error.problem}",
+            where=path,
+            expected="fields as in configs/starter.yaml, with spaces as indents, not tabs",
         ) from error
     except (yaml.YAMLError, RecursionError) as error:
         raise PipelineError(
@@ -466,6 +484,8 @@ def validate(content: Any, path: Path) -> Config:
         PipelineError: naming the file, every wrong field, and valid values.
     """
     origins.check_module("libero")  # It has the list of tasks.
+    if content is None:
+        raise PipelineError("the file is empty", where=path, remedy="copy the fields of configs/starter.yaml into it")
     try:
         return Config.model_validate(content)
     except ValidationError as error:

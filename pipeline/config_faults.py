@@ -19,8 +19,6 @@ EXPECTED = {
     "string_type": "text",
     "bool_type": "true or false",
     "bool_parsing": "true or false",
-    "tuple_type": "a list, such as [1, 2]",
-    "list_type": "a list, such as [1, 2]",
     "model_type": "fields with values",
     "model_attributes_type": "fields with values",
     "dict_type": "names with values",
@@ -43,6 +41,7 @@ EXPECTED = {
 PATTERNS = {
     r"^[a-z][a-z0-9_]*$": "a lower-case letter, then lower-case letters, digits or underscores",
     r"^([a-z][a-z0-9_]*)?$": "a lower-case letter, then lower-case letters, digits or underscores",
+    r"^(local|loop|slurm|\w+://.+)$": "local, loop, slurm, or an address such as tcp://host:8786",
 }
 """Regular expression of a field to its description."""
 
@@ -50,7 +49,8 @@ PATTERNS = {
 def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
     """Describe each fault of a configuration: field, fault, given value.
 
-    An error that only follows from another one, such as a list without its invalid values, is left out.
+    An error that only follows from another one, such as a list without its invalid values, is left out. A fault of
+    several fields names them itself.
 
     Args:
         model: the model that was validated.
@@ -63,18 +63,31 @@ def describe(error: ValidationError, model: type[BaseModel]) -> list[str]:
         follows = any(len(other) > len(location) and other[: len(location)] == location for other in locations)
         if follows and fault["type"] in ("too_short", "too_long"):
             continue
-        field = ".".join(map(str, location)) or "top level"
-        lines.append(f"{field}: {_sentence(fault, model)}")
-    return lines
+        sentence = _sentence(fault, model)
+        if fault["type"] == "missing" and isinstance(location[-1], int):
+            # Each missing entry of a list is a fault of its own; all of them have the same sentence.
+            location = location[:-1]
+        field = ".".join(map(str, location))
+        if not field and fault["type"] != "value_error":
+            field = "the file"
+        lines.append(f"{field}: {sentence}" if field else sentence)
+    return list(dict.fromkeys(lines))
 
 
 def _sentence(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
     context, given = fault.get("ctx", {}), reprlib.repr(fault["input"])
     match fault["type"]:
+        case "value_error" if isinstance(fault["input"], Mapping | BaseModel):
+            return str(context["error"])
         case "value_error":
             return f"{context['error']} (got {given})"
+        case "missing" if isinstance(fault["loc"][-1], int):
+            return f"expected more entries than {len(fault['input'])}, got {given}"
         case "missing":
             return "this field is required"
+        case "tuple_type" | "list_type":
+            example = fault["input"] if isinstance(fault["input"], str) else "1, 2"
+            return f"expected a list, such as [{example}], got {given}"
         case "extra_forbidden":
             *parents, name = fault["loc"]
             return f"unknown field; {_suggestion(str(name), _fields_at(model, tuple(parents)))}"

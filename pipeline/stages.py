@@ -23,7 +23,7 @@ from pipeline.formats.rlds import Rlds
 from pipeline.identity import refuse_unasked
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
-from pipeline.run.claim import claimed, locked
+from pipeline.run.claim import claim_folder, locked
 from pipeline.run.cleaning import say_stale
 from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
 from pipeline.run.foreign import refuse_foreign_files
@@ -99,12 +99,12 @@ def doctor(run: Run) -> None:
     except (PipelineError, PackageNotFoundError):
         # The table of `doctor.run` reports missing packages.
         tried = False
-    if doctor.run(run, tried=tried):
+    failed = doctor.run(run, tried=tried)
+    if failed:
         raise PipelineError(
-            "this machine cannot perform the run",
+            f"the run cannot begin, because of failed checks: {', '.join(failed)}",
             where=run.folder,
-            expected="no check above with the result `fail`",
-            remedy="follow the remedies of the failed checks, and run the command again",
+            remedy="follow the remedies of the failed checks above, and run the command again",
         )
     if not tried:
         machine.record(run, machine.trial().digests)
@@ -200,6 +200,7 @@ def _export(group: str) -> Stage:
 
     def write_datasets(run: Run) -> None:
         for kind in kinds:
+            # The group's first format is named even if it is not requested, so that no stage is silent.
             if kind is kinds[0] or kind.name in run.config.export.formats:
                 export.export_run(kind, run)
         export.list_records(run)
@@ -376,7 +377,7 @@ def run_all(file: Path) -> Run:
     Raises:
         PipelineError: when a stage stops, or another process works in the folder.
     """
-    config = claimed(file)
+    config = claim_folder(file)
     with locked(config.data):
         for number, name in enumerate(STAGES, start=1):
             perform(name, Run(config), f"[{number}/{len(STAGES)}] {name}")

@@ -24,10 +24,13 @@ from pipeline.types import Verdict
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
 
 
-def told(run: Run) -> Iterator[str | Table]:
+def describe(run: Run) -> Iterator[str | Table]:
     """Yield a run's state as a few paragraphs and tables."""
     config = run.config
     yield f"run {run.name}, in {run.folder}"
+    if config.demos.root is not None and not config.demos.root.is_dir():
+        yield f"the run cannot be planned: demos.root: there is no folder {config.demos.root}"
+        return
     try:
         rows = plan_stage.upcoming(run)
     except PipelineError as error:
@@ -44,7 +47,7 @@ def told(run: Run) -> Iterator[str | Table]:
         yield "stages that would run:"
         yield from (f"  {step}: {why}" for step, why in steps.items())
     # Until all episodes are replayed and rendered, undecided candidates count as kept, so nothing is short.
-    if not steps.keys() & {"plan", "replay", "render"}:
+    if not steps.keys() & {"all stages", "plan", "replay", "render"}:
         missing = counts.shortfalls(_targets(config, rows, judged))
         yield from missing
         if not steps:
@@ -99,7 +102,7 @@ def _steps(
     rejected: Mapping[str, str],
 ) -> Iterator[tuple[str, str]]:
     if not rows:
-        yield "plan", "no plan exists yet"
+        yield "all stages", "no plan exists yet; `doctor` checks the demonstrations and estimates the time"
         return
     config = run.config
     why_planned = stages.why_not("plan", run)

@@ -108,7 +108,7 @@ def test_every_field_is_described(model: type[BaseModel]) -> None:
                 "episodes": {"language+layout": 4},
             },
             ("plan",),
-            "if objects are added, axes.language.components must contain distraction or paraphrase",
+            "with goal or layout, axes.language.components must contain distraction or paraphrase",
         ),
         ({"camera": {"distance": {"distance_scale": [[[2, 1]]] * 5}}}, ("plan", "axes"), "with low <= high"),
         ({"camera": {"distance": {"distance_scale": [[[0, 1]]] * 5}}}, ("plan", "axes"), "a positive multiple"),
@@ -141,6 +141,23 @@ def test_every_field_is_described(model: type[BaseModel]) -> None:
         ("My run", ("name",), "name: expected a lower-case letter, then lower-case letters, digits or underscores"),
         ({}, ("export", "lerobot_v21"), "export.lerobot_v21.convention: this field is required"),
         (3, ("plan", "sed"), "plan.sed: unknown field; did you mean seed?"),
+        (
+            {"camera": {"distance": {"distance_scale": [[[1, 2]]]}}},
+            ("plan", "axes"),
+            "distance_scale: expected more entries than 1",
+        ),
+        (
+            "libero_goal/*",
+            ("demos", "tasks"),
+            "demos.tasks: expected a list, such as [libero_goal/*], got 'libero_goal/*'",
+        ),
+        ("slrum", ("compute", "cluster"), "compute.cluster: expected local, loop, slurm, or an address such as tcp://"),
+        (
+            {"libero_goal/put_the_bowl_on_plate": 2},
+            ("plan", "task_weights"),
+            "did you mean libero_goal/put_the_bowl_on_the_plate?",
+        ),
+        ("no.yaml", ("plan", "axes", "language", "bank"), "plan.axes.language.bank: there is no such file (got "),
         ({"background": {"colour_scale": [0.2, 0.4, 0.6, 0.8, 2.0]}}, ("plan", "axes"), "colour_scale.4"),
     ],
 )
@@ -227,9 +244,18 @@ def test_no_run_is_stored_where_all_runs_store(name: str, tmp_path: Path, monkey
         load(file)
 
 
-def test_missing_and_broken_files(tmp_path: Path) -> None:
-    with pytest.raises(PipelineError, match="cannot read the configuration"):
+def test_missing_and_broken_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(REPOSITORY)
+    with pytest.raises(PipelineError, match=r"no\.yaml: there is no such configuration"):
         load(tmp_path / "no.yaml")
+    with pytest.raises(PipelineError, match=r"did you mean configs/starter\.yaml\?"):
+        load(Path("configs/startr.yaml"))
+    (tmp_path / "empty.yaml").write_text("# Nothing yet.\n")
+    with pytest.raises(PipelineError, match=r"empty\.yaml: the file is empty"):
+        load(tmp_path / "empty.yaml")
+    (tmp_path / "tab.yaml").write_text("plan:\n\tseed: 1\n")
+    with pytest.raises(PipelineError, match=r"(?s)tab\.yaml.* in line 2, column 1: .*not tabs"):
+        load(tmp_path / "tab.yaml")
 
     for text in ("plan: [1,\n", "[" * 1500 + "]" * 1500):
         (tmp_path / "broken.yaml").write_text(text)
@@ -245,7 +271,9 @@ def test_missing_and_broken_files(tmp_path: Path) -> None:
 )
 def test_a_key_that_is_given_twice_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "dup.yaml").write_text(text)
-    with pytest.raises(PipelineError, match=r"dup\.yaml.*not valid YAML: the key '(plan|camera)' is repeated"):
+    with pytest.raises(
+        PipelineError, match=r"dup\.yaml.*not valid YAML in line \d, column \d+: the key '(plan|camera)' is repeated"
+    ):
         load(tmp_path / "dup.yaml")
 
 

@@ -36,7 +36,7 @@ from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum, read_json, write
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
-from pipeline.run.claim import owned
+from pipeline.run.claim import open_run
 from pipeline.seeding import digest
 
 HERE = Path(__file__).resolve().parent
@@ -167,7 +167,7 @@ class Work:
         config = self.out / f"all_arms_{digest(names)[:8]}.yaml"
         sections = self.experiment.run.model_dump(mode="json", include={"demos", "plan"}, exclude_defaults=True)
         write(config, yaml.safe_dump({"name": config.stem, "folder": str(self.out), **sections}))
-        plan_file, kept_plan = owned(config).plan_file, kept / f"{config.stem}.parquet"
+        plan_file, kept_plan = open_run(config).plan_file, kept / f"{config.stem}.parquet"
         if not kept_plan.exists():
             rows: list[plan.Row] = []
             for arm in self.experiment.every_arm:

@@ -108,7 +108,7 @@ def offered(source: Source) -> Iterator[Texture]:
             files = _images(source.folder)
             if not files:
                 raise PipelineError(
-                    "the folder has no images",
+                    "the folder has no images" if source.folder.is_dir() else "there is no such folder",
                     where=source.folder,
                     expected="PNG or JPEG files",
                     remedy="correct the folder in plan.axes.background.sources",

@@ -10,6 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
@@ -77,6 +78,9 @@ class LazyGroup(click.Group):
                 return command
         if name in self.moved:
             raise click.UsageError(f"the command `{name}` is now `{self.moved[name]}`", context)
+        similar = get_close_matches(name, self.list_commands(context), n=1)
+        if similar:
+            raise click.UsageError(f"there is no command `{name}`; did you mean `{similar[0]}`?", context)
         return None
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
@@ -96,7 +100,9 @@ class OneOf(click.ParamType[str]):
     def convert(self, value: str, parameter: click.Parameter | None, context: click.Context | None) -> str:
         names = list(self._load_names())
         if value not in names:
-            self.fail(f"{value!r} is not one of {', '.join(names)}.", parameter, context)
+            similar = get_close_matches(value, names, n=1)
+            question = f" Did you mean {similar[0]}?" if similar else ""
+            self.fail(f"{value!r} is not one of {', '.join(names)}.{question}", parameter, context)
         return value
 
     def shell_complete(
@@ -203,8 +209,8 @@ def open_run(config: Path) -> Run:
     """Open the run of a configuration.
 
     Raises:
-        PipelineError: as ``run.claim.owned``.
+        PipelineError: as ``run.claim.open_run``.
     """
     from pipeline.run import claim
 
-    return claim.owned(config)
+    return claim.open_run(config)

@@ -85,6 +85,9 @@ def audit(dataset: Path, manifest: Path | None) -> int:
     from pipeline.testset import benchmark
     from pipeline.validation import audit
 
+    if not dataset.is_dir():
+        # The benchmark's list of tests is downloaded at its first use.
+        raise PipelineError("there is no such folder", where=dataset, expected="an RLDS or LeRobot dataset")
     result = audit.audit(dataset, benchmark.load(), manifest)
     rich.print(leakage.report(result.axes))
     if result.without_task:

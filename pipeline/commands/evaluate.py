@@ -108,7 +108,7 @@ def evaluate(
     (kind,) = chosen
     policy = {"kind": replay} if kind == "replay" else {"kind": kind, "address": str(policies[kind])}
     config = PolicyConfig.model_validate(policy | given(options, PolicyConfig))
-    plan = {"plan": claim.owned(trained_on).plan_file} if trained_on else {}
+    plan = {"plan": claim.open_run(trained_on).plan_file} if trained_on else {}
     settings = EpisodeSettings.model_validate(given(options, EpisodeSettings) | plan)
     evaluation = Evaluation(settings, config, config.identity(), out, videos=videos, archive=assets)
     table_path = out / "paper_table"

@@ -30,22 +30,24 @@ def doctor(config: Path) -> int:
     from pipeline.run.run import Run
     from pipeline.validation import doctor
 
-    return doctor.run(Run(load_config(config)))
+    return int(bool(doctor.run(Run(load_config(config)))))
 
 
 @click.command(cls=Command, epilog=example("axes"))
 def axes() -> None:
-    """List the axes of perturbation, their components, and the parts of an episode that each axis generates again."""
+    """List the axes of perturbation, with their components, regenerated parts of an episode and changed views."""
     from rich.console import Console
     from rich.table import Table
 
     from pipeline.axes import AXES, components_of
+    from pipeline.episode_schema import ALL_VIEWS
 
-    table = Table("axis", "components", "generated again", "changes", box=None, pad_edge=False)
+    names_of_views = {frozenset(ALL_VIEWS): "all", frozenset({"image"}): "agent view", frozenset[str](): "none"}
+    table = Table("axis", "components", "generated again", "changed views", box=None, pad_edge=False)
     for axis in AXES:
         kind = AXES[axis].draws[0]
-        views = " and ".join(sorted(kind.views)) or "instruction"
-        table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
+        components = ", ".join(components_of(axis))
+        table.add_row(axis, components, kind.layer.name.lower(), names_of_views[kind.views])
     Console(highlight=False).print(table)
     print("Ranges and levels: see docs/configuration.md and docs/axes.md.")
     print("Pictures of an axis: see `python -m pipeline preview --help`.")

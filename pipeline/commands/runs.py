@@ -68,7 +68,7 @@ def status(config: Path) -> None:
     from pipeline import status
 
     console = Console(soft_wrap=True, highlight=False)
-    for part in status.told(open_run(config)):
+    for part in status.describe(open_run(config)):
         console.print(part)
 
 

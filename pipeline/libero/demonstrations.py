@@ -196,33 +196,56 @@ class HDF5Source:
         # Episodes are identified by content: two copies would make two rows with one id.
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
-            usable = 0
-            of_file = _Remarks()
+            remarks = _Remarks()
             try:
                 with self._data(task) as data:
-                    for key in hdf5.names(data, str(self._path(task))):
-                        if usable == per_task:
-                            break
-                        try:
-                            entry = DemoEntry.of(self._read(task, key, data))
-                        except PipelineError as error:
-                            problems.append(Problem(f"{task}/{key}", error))
-                            continue
-                        first = first_with.setdefault(entry.sha256, entry)
-                        if first is not entry:
-                            of_file.copies[key] = first.demo_id
-                        elif _has_added_objects(entry):
-                            of_file.with_added_objects.append(key)
-                        else:
-                            entries.append(entry)
-                            usable += 1
-                            outside = _outside(data, key, str(self._path(task)))
-                            if outside:
-                                of_file.clipped[key] = outside
-                notes += self._notes(task, of_file)
+                    usable, unusable = self._index_file(task, data, per_task, first_with, remarks)
+                notes += self._notes(task, remarks)
             except PipelineError as error:
-                problems.append(Problem(str(task), error))
+                usable, unusable = [], [Problem(str(task), error)]
+            entries += usable
+            problems += unusable
         return DemoIndex(entries, problems, tuple(notes))
+
+    def _index_file(
+        self,
+        task: Task,
+        data: h5py.Group,
+        per_task: int | None,
+        first_with: dict[str, DemoEntry],
+        remarks: _Remarks,
+    ) -> tuple[list[DemoEntry], list[Problem]]:
+        """Index the demonstrations of one file.
+
+        Args:
+            data: the group of the file's demonstrations.
+            first_with: content of a demonstration to its first entry; extended.
+            remarks: extended.
+
+        Returns:
+            The usable demonstrations, at most ``per_task``, and the problems of the unusable ones among them.
+        """
+        entries: list[DemoEntry] = []
+        problems: list[Problem] = []
+        for key in hdf5.names(data, str(self._path(task))):
+            if len(entries) == per_task:
+                break
+            try:
+                entry = DemoEntry.of(self._read(task, key, data))
+            except PipelineError as error:
+                problems.append(Problem(f"{task}/{key}", error))
+                continue
+            first = first_with.setdefault(entry.sha256, entry)
+            if first is not entry:
+                remarks.copies[key] = first.demo_id
+            elif _has_added_objects(entry):
+                remarks.with_added_objects.append(key)
+            else:
+                entries.append(entry)
+                outside = _outside(data, key, str(self._path(task)))
+                if outside:
+                    remarks.clipped[key] = outside
+        return entries, problems
 
     def load(self, demo_id: str) -> Demo:
         """Load one demonstration, by its id."""

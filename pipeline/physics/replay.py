@@ -23,7 +23,6 @@ from pipeline.physics.tracking import Route, follow
 from pipeline.types import Demo, Floats, Push, Scene, Task, Trajectory, Verdict
 
 
-# Six arguments: environment, demonstration, name, settings, perturbations, and the reference for tracking.
 def replay(
     environment: Environment,
     demo: Demo,
@@ -50,7 +49,7 @@ def replay(
     """
     fixed_machine_code()
     try:
-        scene, refused = _perturbed(environment, demo, replay_config, perturbations)
+        scene, refused = _apply_perturbations(environment, demo, replay_config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
         scene = Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)})
@@ -58,26 +57,25 @@ def replay(
         dropped = Verdict(False, error.reason)
         return Trajectory(trajectory_id, "open_loop", scene, demo.init_state[None], none, alpha, dropped)
 
-    def no_actions() -> Iterator[Floats]:
-        return iter(())
+    if refused:
+        mode = "tracked" if replay_config.mode == "tracked" and reference() is not None else "open_loop"
+        # The first state alone is stored.
+        states, actions, alphas, _ = _execute(environment, scene, 0, lambda: iter(()))
+        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
-        if refused:
-            settle_steps, executed_policy = 0, no_actions
-        else:
-            settle_steps, executed_policy = replay_config.settle_steps, policy
-        states, actions, alphas, judged = _execute(environment, scene, settle_steps, executed_policy)
-        if judged.kept and (fault := _fault_of(perturbations, actions)):
+        states, actions, alphas, judged = _execute(environment, scene, replay_config.settle_steps, policy)
+        fault = _fault_of(perturbations, actions) if judged.kept else None
+        if fault is not None:
             judged = Verdict(False, fault)
-        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused or judged)
+        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, judged)
 
     # Recorded actions do not work against a push, so mode ``auto`` tracks pushed scenes even if they reach the goal.
-    pushed = scene.push is not None and not refused
-    tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and pushed)
+    tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and scene.push is not None)
     followed = reference() if tracks else None
     if followed is None:
         open_loop = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, replay_config.noops)]))
-        if replay_config.mode != "auto" or open_loop.verdict.kept or refused:
+        if replay_config.mode != "auto" or open_loop.verdict.kept:
             return open_loop
         followed = reference()
         if followed is None:
@@ -125,7 +123,7 @@ def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats
     return follow(Route.through(reference, environment.hand, poses), lambda: environment.hand, environment.pose)
 
 
-def _perturbed(
+def _apply_perturbations(
     environment: Environment, demo: Demo, replay_config: ReplayConfig, perturbations: Sequence[PhysicsPerturbation]
 ) -> tuple[Scene, Verdict | None]:
     """Return the perturbed scene in which the replay starts.

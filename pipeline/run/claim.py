@@ -41,7 +41,7 @@ class Mark(NamedTuple):
     content: str | None
 
 
-def claimed(file: Path) -> Config:
+def claim_folder(file: Path) -> Config:
     """Load a configuration for a run, and mark the run's folder as belonging to it.
 
     A stage deletes finished work that its plan does not name, so two configuration files must never share a folder.
@@ -101,13 +101,14 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def owned(file: Path) -> Run:
+def open_run(file: Path) -> Run:
     """Open the run of a configuration to read it; nothing is written.
 
     Raises:
         PipelineError: when the configuration is not valid, or the folder belongs to another file.
     """
     config = load(file)
+    _refuse_missing_disk(config, file)
     if (config.data / OWNER).exists():
         _refuse_other_owner(config, file)
     return Run(config)
@@ -169,9 +170,21 @@ def refuse_other_folder(file: Path) -> None:
         )
 
 
+def _refuse_missing_disk(config: Config, file: Path) -> None:
+    """Reject a mistyped absolute path, below which a run would fill the disk of the system."""
+    if config.folder.is_absolute() and not config.folder.parent.exists():
+        raise PipelineError(
+            f"folder: {config.folder.parent} does not exist",
+            where=file,
+            expected="a folder in an existing one",
+            remedy=f"correct `folder:`, or create {config.folder.parent}",
+        )
+
+
 def _refuse_other_owner(config: Config, file: Path) -> None:
-    """Reject a folder that ``claimed`` must not give to a configuration file."""
+    """Reject a folder that must not be given to a configuration file."""
     folder = config.data
+    _refuse_missing_disk(config, file)
     refuse_unmarked(folder)
     _refuse_folder_in_run(folder)
     mark = _mark(folder)

@@ -82,7 +82,8 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
         target.record_file.unlink(missing_ok=True)
         print(f"no replay missed its goal, so {target.folder} was not written")
         return
-    if is_current(target, episodes):
+    if is_up_to_date(target, episodes):
+        remove_leftovers(target)
         print(f"{target.folder} is up to date, with {len(episodes.ids)} episodes: see {target.record_file}")
         return
     refuse_unasked(outdated(target, episodes), target.folder)
@@ -105,7 +106,7 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
     if recorded and not foreign:
         foreign = _unrecorded(target.folder, recorded)
     if foreign:
-        raise _foreign(target, foreign, sets)
+        raise _foreign_entries_error(target, foreign, sets)
 
 
 def _recorded(target: AnyFormat) -> set[str]:
@@ -121,7 +122,7 @@ def _recorded(target: AnyFormat) -> set[str]:
     return recorded
 
 
-def _foreign(target: AnyFormat, foreign: Sequence[Path], sets: Collection[str]) -> PipelineError:
+def _foreign_entries_error(target: AnyFormat, foreign: Sequence[Path], sets: Collection[str]) -> PipelineError:
     """Return the error about entries of a dataset's folder that no export wrote."""
     return PipelineError(
         f"the entry is not of this run's {target.title} and would be deleted ({len(foreign)} such entries)",
@@ -278,17 +279,18 @@ def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
     return Counter({f"files, generated with {record.why_not(basis)}": len(record.files)})
 
 
-def is_current(target: AnyFormat, episodes: Episodes) -> bool:
+def is_up_to_date(target: AnyFormat, episodes: Episodes) -> bool:
     """Return whether the dataset exists, is complete and has these episodes.
 
-    Every file must exist and be no younger than the record. If so, statistics that a client stored in the sets are
-    removed.
+    Every file must exist and be no younger than the record.
     """
-    if not untouched(target) or not target.record().matches(compute_basis(target, episodes)):
-        return False
+    return untouched(target) and target.record().matches(compute_basis(target, episodes))
+
+
+def remove_leftovers(target: AnyFormat) -> None:
+    """Delete statistics that a client stored in the sets of a finished dataset, and the work folder of killed calls."""
     keep_below(target.folder, {target.folder / name for name in target.record().files})
     _clear_work(target)
-    return True
 
 
 def untouched(target: AnyFormat) -> bool:
@@ -378,7 +380,7 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, workers)
         # A worker has the format's packages loaded already.
-        (places,) = workers(partial(_assembled, target, work), [pieces], f"{target.title} assembly")
+        (places,) = workers(partial(_assemble, target, work), [pieces], f"{target.title} assembly")
         dataset = work / "dataset"
         sync(dataset)
         paths = sorted(file for file in dataset.rglob("*") if file.is_file())
@@ -404,7 +406,7 @@ def _replace(target: AnyFormat, work: Path) -> None:
         recorded = _recorded(target)
         foreign = _unrecorded(target.folder, recorded)
         if foreign:
-            raise _foreign(target, foreign, {name.partition("/")[0] for name in recorded})
+            raise _foreign_entries_error(target, foreign, {name.partition("/")[0] for name in recorded})
         if target.folder.exists():
             os.replace(target.folder, target.work / BEFORE)
         target.record_file.unlink(missing_ok=True)  # This record is of the earlier dataset.
@@ -430,7 +432,7 @@ def _write_piece(target: AnyFormat, load: Load, todo: tuple[Path, Piece]) -> Non
         target.write_piece(temporary, piece, load)
 
 
-def _assembled(target: AnyFormat, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
+def _assemble(target: AnyFormat, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
     # Delete what a lost worker left unfinished.
     keep_below(work, {work / piece.path for piece in pieces})
     return target.assemble(work, pieces)

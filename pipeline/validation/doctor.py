@@ -4,7 +4,7 @@ import base64
 import ctypes.util
 import hashlib
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, PackagePath, distribution, metadata, requires, version
 from importlib.util import find_spec
@@ -84,24 +84,29 @@ def check(run: Run, need_gb: float) -> list[Diagnosis]:
     ]
 
 
-def run(run: Run, *, tried: bool = False) -> int:
+def run(run: Run, *, tried: bool = False) -> list[str]:
     """Print the results of ``check`` and of a trial for a configuration.
 
     Args:
         tried: True if the trial has run before on this machine, which has not changed since.
 
     Returns:
-        The exit status: 1 if a check fails, else 0.
+        The names of the failed checks.
     """
     # Finished files of a folder need no more space. Larger folders, such as a former dataset, do not reduce the need
     # of the others.
     left_mb = (max(0.0, mb - size_mb(run.path(folder))) for folder, mb in needed_mb(run.config).items())
     findings = check(run, max(sum(left_mb), RUN_MB) / 1e3)
-    if all(finding.status != "fail" for finding in findings):
+    if not _failed(findings):
         findings += _tried(run, tried)
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     console.print(_in_lines(findings, console.width))
-    return int(any(finding.status == "fail" for finding in findings))
+    return _failed(findings)
+
+
+def _failed(findings: Iterable[Diagnosis]) -> list[str]:
+    """List the names of failed checks."""
+    return [finding.name for finding in findings if finding.status == "fail"]
 
 
 def _in_lines(findings: Sequence[Diagnosis], width: int) -> Text:

@@ -27,7 +27,7 @@ from pipeline.files import edition
 from pipeline.formats.rlds import Rlds
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.run import manifest
-from pipeline.run.claim import claimed
+from pipeline.run.claim import claim_folder
 
 HELP = """
 import sys
@@ -88,6 +88,22 @@ def test_a_moved_command_names_its_new_place(
         monkeypatch.setattr(sys, "argv", ["pipeline", former, "whatever"])
         assert main() == 2
         assert f"the command `{former}` is now `{present}`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["runn", "configs/starter.yaml"], "there is no command `runn`; did you mean `run`?"),
+        (["dataset", "chek", "configs/starter.yaml"], "there is no command `chek`; did you mean `check`?"),
+        (["demos", "fetch", "data/demos", "libero_gaol"], "Did you mean libero_goal?"),
+    ],
+)
+def test_a_misspelled_word_is_answered_with_the_closest_one(
+    words: list[str], expected: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pipeline", *words])
+    assert main() == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
 
 
 def test_an_error_while_a_command_is_imported_has_its_remedy_too() -> None:
@@ -196,7 +212,7 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path
         if "no stage would run: all datasets are finished" in lines:
             return []
         told = [line.partition(":")[0] for line in lines[lines.index("stages that would run:") + 1 :] if ": " in line]
-        assert told[-1] == "time left" or told[-2:] == ["plan", "disk"], "there is no estimate without a plan"
+        assert told[-1] == "time left" or told[-2:] == ["all stages", "disk"], "there is no estimate without a plan"
         return [line for line in told if line not in ("disk", "time left")]
 
     before = {file: file.stat().st_mtime_ns for file in clone.rglob("*")}
@@ -247,7 +263,7 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path
     assert re.search(r"no longer needed: \d+ episodes of the datasets", told), "they would be replaced"
     for record in ("rlds.json", "lerobot.json"):
         (clone / "data/tiny" / record).unlink()
-    assert would_run(status()) == ["plan"]
+    assert would_run(status()) == ["all stages"]
 
 
 def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
@@ -291,7 +307,7 @@ def ablation(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Ablati
     (clone / "params.yaml").write_text("run: other\ndata: data\n")
     configured(clone, folder=str(data.parent))
     with chdir(clone):
-        claimed(Path("configs/tiny.yaml"))
+        claim_folder(Path("configs/tiny.yaml"))
     where = {"axis": ["clean", "camera"], "suite": ["libero_goal"]}
     configured(clone, export={"rlds": {"name": "libero_tiny"}, "lerobot": None, "where": where})
     for name in ("plan.parquet", "report.html"):

@@ -31,7 +31,7 @@ from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
 from pipeline.planning.plan import Draws, Row
-from pipeline.run.claim import claimed
+from pipeline.run.claim import claim_folder
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Task
@@ -324,7 +324,7 @@ def run_stage(folder: Path, rows: list[Row], **axes: dict[str, str]) -> subproce
     config["plan"]["axes"] |= axes
     (folder / "tiny.yaml").write_text(yaml.safe_dump(config))
     with chdir(folder):
-        claimed(Path("tiny.yaml"))
+        claim_folder(Path("tiny.yaml"))
     plan.write(rows, folder / "data" / "tiny" / "plan.parquet")
     command = [sys.executable, str(REPOSITORY / "stages" / "leakage.py"), "tiny.yaml"]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)

@@ -22,7 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.generated import generated
 from pipeline.libero import hdf5
 from pipeline.planning import plan
-from pipeline.run.claim import LOCK, OWNER, claimed, locked, owned, refuse_other_folder
+from pipeline.run.claim import LOCK, OWNER, claim_folder, locked, open_run, refuse_other_folder
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 def test_a_copy_with_the_old_name_is_refused_before_anything_else(clone: Path) -> None:
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     trajectory = clone / "data" / "tiny" / "trajectories" / "0123.npz"
     trajectory.parent.mkdir()
     trajectory.write_bytes(b"hours of work")
@@ -71,7 +71,7 @@ def test_dvc_s_run_must_be_where_dvc_looks(clone: Path, field: str, value: str, 
 
 
 def test_push_refuses_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     shutil.copy("configs/tiny.yaml", "configs/copy.yaml")
     monkeypatch.setattr(sys, "argv", ["pipeline", "dataset", "push", "rlds", "somebody/tiny", "configs/copy.yaml"])
     assert command_line.main() == 1
@@ -79,12 +79,24 @@ def test_push_refuses_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsy
 
 
 def test_an_edited_file_keeps_its_folder_however_it_is_named(clone: Path) -> None:
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     file = clone / "configs" / "tiny.yaml"
     config = yaml.safe_load(file.read_text())
     config["plan"]["seed"] = 8
     file.write_text(yaml.safe_dump(config))
-    assert claimed(file).plan.seed == owned(Path("configs/../configs/tiny.yaml")).config.plan.seed == 8
+    assert claim_folder(file).plan.seed == open_run(Path("configs/../configs/tiny.yaml")).config.plan.seed == 8
+
+
+def test_no_missing_disk_is_replaced_by_a_new_folder(clone: Path, tmp_path: Path) -> None:
+    """With a mistyped absolute path, a run would fill another disk."""
+    file, disk = Path("configs/tiny.yaml"), tmp_path / "disk"
+    edit(file, folder=str(disk / "me" / "data"))
+    for use in (claim_folder, open_run):
+        with pytest.raises(PipelineError, match=f"configs/tiny.yaml: folder: {disk}/me does not exist"):
+            use(file)
+    assert not disk.exists()
+    (disk / "me").mkdir(parents=True)
+    assert claim_folder(file).data == disk / "me" / "data" / "tiny"
 
 
 def edit(file: Path, **fields: object) -> None:
@@ -94,24 +106,24 @@ def edit(file: Path, **fields: object) -> None:
 
 def test_a_renamed_file_keeps_the_folder_until_it_is_edited(clone: Path) -> None:
     renamed, mark = Path("configs/renamed.yaml"), clone / "data" / "tiny" / OWNER
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     Path("configs/tiny.yaml").rename(renamed)
     unedited = renamed.read_text()
     edit(renamed, plan={"seed": 6, "episodes": {"noise": 4}})
     with pytest.raises(PipelineError, match=r"belongs to configs/tiny\.yaml, which is missing"):
-        claimed(renamed)
+        claim_folder(renamed)
     renamed.write_text(unedited)
-    claimed(renamed)
+    claim_folder(renamed)
     edit(renamed, plan={"seed": 6, "episodes": {"noise": 4}})
-    claimed(renamed)
+    claim_folder(renamed)
 
     mark.write_text('{"configuration": "../../configs/gone.yaml", "content": "another"}')
     with pytest.raises(PipelineError, match=r"belongs to configs/gone\.yaml") as caught:
-        claimed(renamed)
+        claim_folder(renamed)
     advised = re.search(r"write ({.*}) into (.*)$", str(caught.value.remedy))
     assert advised is not None
     Path(advised[2]).write_text(advised[1])
-    claimed(renamed)
+    claim_folder(renamed)
 
 
 @pytest.mark.parametrize("edited", [False, True])
@@ -123,7 +135,7 @@ def test_a_checkout_that_was_moved_keeps_its_runs(edited: bool, clone: Path, mon
     if not edited:
         edit(checkout / file, folder=str(disk))
     monkeypatch.chdir(checkout)
-    finished = claimed(file).data / "trajectories" / "0123456789abcdef.h5"
+    finished = claim_folder(file).data / "trajectories" / "0123456789abcdef.h5"
     finished.parent.mkdir()
     finished.write_bytes(b"hours of work")
     monkeypatch.chdir(clone)
@@ -131,7 +143,7 @@ def test_a_checkout_that_was_moved_keeps_its_runs(edited: bool, clone: Path, mon
     monkeypatch.chdir(clone / "renamed")
     if edited:
         edit(file, replay={"mode": "open_loop"})
-    data = claimed(file).data
+    data = claim_folder(file).data
     assert (data / "trajectories" / finished.name).read_bytes() == b"hours of work"
 
 
@@ -141,60 +153,60 @@ def test_a_file_may_be_named_by_its_absolute_path_and_from_elsewhere(
     """Here with a run's folder inside the checkout that `folder:` names in full."""
     file = Path("configs/tiny.yaml")
     edit(file, folder=str(clone / "results"))
-    claimed(file)
+    claim_folder(file)
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
-    assert claimed(clone / file).data == owned(clone / file).folder == clone / "results" / "tiny"
+    assert claim_folder(clone / file).data == open_run(clone / file).folder == clone / "results" / "tiny"
     monkeypatch.chdir(clone)
-    claimed(file)
+    claim_folder(file)
 
 
 def test_marks_of_earlier_versions_count(clone: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     file, mark = Path("configs/tiny.yaml"), clone / "data" / "tiny" / OWNER
-    claimed(file)
+    claim_folder(file)
     for owner in ("configs/tiny.yaml", str(clone / "configs" / "tiny.yaml")):
         mark.write_text(json.dumps({"configuration": owner, "name": "tiny"}))
-        claimed(file)
+        claim_folder(file)
     mark.write_text(json.dumps({"configuration": "configs/other.yaml", "name": "tiny"}))
     with pytest.raises(PipelineError, match=r"belongs to configs/other\.yaml"):
-        claimed(file)
+        claim_folder(file)
 
 
 def test_a_moved_folder_stays_its_configurations_through_a_link(
     clone: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     file, disk, data = Path("configs/tiny.yaml"), tmp_path_factory.mktemp("disk") / "tiny", Path("data/tiny")
-    claimed(file)
+    claim_folder(file)
     shutil.move(data, disk)
     data.symlink_to(disk)
-    claimed(file)
+    claim_folder(file)
     data.unlink()
     shutil.move(disk, data)
-    claimed(file)
+    claim_folder(file)
 
 
 def test_a_folder_that_was_moved_to_where_the_configuration_says_is_found(
     clone: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     file, disk = Path("configs/tiny.yaml"), tmp_path_factory.mktemp("disk")
-    claimed(file)
+    claim_folder(file)
     shutil.move("data/tiny", disk / "tiny")
     edit(file, folder=str(disk))
-    assert claimed(file).data == owned(file).folder == disk / "tiny"
+    assert claim_folder(file).data == open_run(file).folder == disk / "tiny"
     edit(file, plan={"seed": 6, "episodes": {"noise": 4}})
-    claimed(file)
+    claim_folder(file)
     shutil.move(disk / "tiny", "data/tiny")
     edit(file, folder="data")
-    claimed(file)
+    claim_folder(file)
 
 
 def test_a_folder_whose_configuration_is_out_of_sight_is_not_for_another_content(clone: Path) -> None:
     """As a folder on a shared disk, claimed by a checkout that another machine has on its own disk."""
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     mark = Path("data/tiny") / OWNER
     mark.write_text(json.dumps(json.loads(mark.read_text()) | {"configuration": "../../../machine/configs/tiny.yaml"}))
     edit(Path("configs/tiny.yaml"), plan={"seed": 6, "episodes": {"noise": 4}})
     with pytest.raises(PipelineError, match=r"which is missing, and .*configs/tiny\.yaml has different content"):
-        claimed(Path("configs/tiny.yaml"))
+        claim_folder(Path("configs/tiny.yaml"))
 
 
 @pytest.mark.parametrize("place", ["frames/1.png", "notes.txt", ".hidden/key", "configuration.yaml"])
@@ -206,7 +218,7 @@ def test_a_folder_with_files_that_no_run_made_is_not_claimed(place: str, clone: 
     with pytest.raises(
         PipelineError, match=f"data/tiny: the folder contains files and is not the folder of a run.*{place[:6]}"
     ):
-        claimed(Path("configs/tiny.yaml"))
+        claim_folder(Path("configs/tiny.yaml"))
     assert {path: path.lstat().st_mtime_ns for path in clone.rglob("*")} == before
 
 
@@ -214,16 +226,16 @@ def test_a_file_in_place_of_the_folder_is_named(clone: Path) -> None:
     (clone / "data").mkdir()
     (clone / "data" / "tiny").write_bytes(b"mine")
     with pytest.raises(PipelineError, match="data/tiny: the path is not a folder"):
-        claimed(Path("configs/tiny.yaml"))
+        claim_folder(Path("configs/tiny.yaml"))
 
 
 def test_a_folder_inside_another_runs_is_refused(clone: Path) -> None:
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     inner = Path("configs/frames.yaml")
     shutil.copy("configs/tiny.yaml", inner)
     edit(inner, name="frames", folder="data/tiny")
     with pytest.raises(PipelineError, match=r"is inside .*data/tiny, the folder of another run"):
-        claimed(inner)
+        claim_folder(inner)
     assert not Path("data/tiny/frames").exists()
 
 
@@ -233,10 +245,10 @@ def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
     shared, other, file = tmp_path_factory.mktemp("disk"), tmp_path_factory.mktemp("other"), Path("configs/tiny.yaml")
     file.write_text(file.read_text() + f"folder: {shared}\n")
     shutil.copytree("configs", other / "configs")
-    claimed(file)
+    claim_folder(file)
     monkeypatch.chdir(other)
     with pytest.raises(PipelineError, match=f"the folder belongs to {clone / file}, and {other / file} has the same"):
-        claimed(file)
+        claim_folder(file)
 
 
 @pytest.mark.parametrize("stage", ["replay", "render"])
@@ -244,7 +256,7 @@ def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> 
     """Else their replays would be stored under the ids of the settings before, and stay when these are put back."""
     config = Config.model_validate(yaml.safe_load(Path("configs/tiny.yaml").read_text()))
     rows = plan.twins(config.demos.index().entries, 0, config.replay)
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     plan.write(rows, clone / "data" / "tiny" / "plan.parquet")
     edited = config.model_dump(mode="json") | {"replay": {"mode": "open_loop", "settle_steps": 10}}
     with pytest.raises(AssertionError, match="the section replay has changed since the plan"):
@@ -271,16 +283,16 @@ def test_a_plan_without_a_task_that_was_asked_for_is_refused(clone: Path) -> Non
 
 
 def test_reading_a_run_writes_nothing(clone: Path) -> None:
-    owned(Path("configs/tiny.yaml"))
+    open_run(Path("configs/tiny.yaml"))
     assert not (clone / "data").exists()
 
 
 def test_a_mark_that_cannot_be_read_is_named(clone: Path) -> None:
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     mark = Path("data/tiny") / OWNER
     mark.write_text("")
     with pytest.raises(PipelineError, match=f"{mark}: the mark of the folder does not name a configuration file"):
-        claimed(Path("configs/tiny.yaml"))
+        claim_folder(Path("configs/tiny.yaml"))
 
 
 def test_one_stage_of_a_run_works_at_a_time(tmp_path: Path) -> None:
@@ -325,17 +337,17 @@ def test_what_a_killed_stage_left_goes_with_the_next_one(tmp_path: Path) -> None
 
 def test_a_full_disk_leaves_no_half_of_the_mark(clone: Path) -> None:
     with pytest.raises(OSError, match="File too large"), limited(resource.RLIMIT_FSIZE, 10):
-        claimed(Path("configs/tiny.yaml"))
-    claimed(Path("configs/tiny.yaml"))
+        claim_folder(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     assert json.loads((clone / "data" / "tiny" / OWNER).read_text())["configuration"] == "../../configs/tiny.yaml"
 
 
 def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
     """A stage deletes what it did not plan: what the link leads to may be somebody else's."""
-    data = claimed(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).data
     (data / "frames").symlink_to(clone / "configs")
     with pytest.raises(PipelineError, match="data/tiny/frames: the entry of the run's folder is a symbolic link"):
-        claimed(Path("configs/tiny.yaml"))
+        claim_folder(Path("configs/tiny.yaml"))
 
 
 FOREIGN = (
@@ -350,7 +362,7 @@ FOREIGN = (
 
 @pytest.mark.parametrize("place", FOREIGN)
 def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone: Path) -> None:
-    theirs = claimed(Path("configs/tiny.yaml")).data / place
+    theirs = claim_folder(Path("configs/tiny.yaml")).data / place
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
     with pytest.raises(
@@ -361,7 +373,7 @@ def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone
 
 
 def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
-    data = claimed(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).data
     link = data / "trajectories" / "0123456789abcdef.npz"
     link.parent.mkdir()
     link.symlink_to(clone / "configs" / "tiny.yaml")
@@ -373,7 +385,7 @@ def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
 def test_clean_names_a_file_that_no_stage_made(
     place: str, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    theirs = claimed(Path("configs/tiny.yaml")).data / place
+    theirs = claim_folder(Path("configs/tiny.yaml")).data / place
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
     monkeypatch.setattr(sys, "argv", ["pipeline", "clean", "--yes", "configs/tiny.yaml"])
@@ -393,7 +405,7 @@ def test_clean_names_an_edited_file(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    data = claimed(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).data
     edited, folder = data / place, data / place.partition("/")[0]
     edited.parent.mkdir(parents=True)
     if state != "without a record":
@@ -419,7 +431,7 @@ def test_clean_names_an_edited_file(
 def test_clean_names_a_file_that_no_export_recorded(
     place: str, recorded: bool, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = claimed(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).data
     theirs = data / place
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
@@ -449,7 +461,7 @@ def test_clean_needs_a_mark_and_names_foreign_files(
     assert "data/tiny: the folder contains files and is not the folder of a run" in capsys.readouterr().err
     theirs.rename("holiday.jpg")
     theirs.parent.rmdir()
-    claimed(Path("configs/tiny.yaml"))
+    claim_folder(Path("configs/tiny.yaml"))
     theirs.parent.mkdir()
     Path("holiday.jpg").rename(theirs)
     assert command_line.main() == 1

@@ -81,7 +81,7 @@ def test_a_run_stops_before_it_deletes_and_status_and_doctor_say_the_same(
     run = Run(load(Path("configs/tiny.yaml")))
     amount = str(dropped.measure(plan_stage.upcoming(run), run))
     assert amount in str(error.value)
-    assert any(amount in part for part in status.told(run) if isinstance(part, str))
+    assert any(amount in part for part in status.describe(run) if isinstance(part, str))
     finding = doctor._finished(run)
     assert finding.status == "warn"
     assert amount in finding.detail
@@ -142,7 +142,7 @@ def test_datasets_count_as_finished_work_after_their_frames_were_deleted(clone: 
     run = Run(load(Path("configs/tiny.yaml")))
     amount = str(dropped.measure(plan_stage.upcoming(run), run))
     assert amount in str(error.value)
-    assert any(amount in part for part in status.told(run) if isinstance(part, str))
+    assert any(amount in part for part in status.describe(run) if isinstance(part, str))
     assert amount in doctor._finished(run).detail
 
 

@@ -19,7 +19,7 @@ from pipeline.formats.base import Export, Format
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.record import Basis
-from pipeline.run.export import export, is_current
+from pipeline.run.export import export, is_up_to_date, remove_leftovers
 from pipeline.types import Episode
 
 PIECES = 3
@@ -105,7 +105,7 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
         check=False,
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert not is_current(made, source)
+    assert not is_up_to_date(made, source)
     (work,) = (folder for folder in made.work.iterdir() if folder.name != "before")
     whole = {path: path.stat() for piece in made.pieces(source) if (path := work / piece.path).exists()}
     if where in ("rename", "record"):
@@ -141,28 +141,29 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
 def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_path: Path) -> None:
     made, source = target(name, tmp_path), episodes()
     export(made, source, loop)
-    assert is_current(made, source)
+    assert is_up_to_date(made, source)
     # What a client leaves is no part of the dataset.
     first = made.folder / next(iter(made.record().files))
     before = stamps(made.folder)
     (first.parent / "dataset_statistics_0123.json").write_text("{}")
     (made.work / "foreign").mkdir(parents=True)
-    assert is_current(made, source)
+    assert is_up_to_date(made, source)
+    remove_leftovers(made)
     assert stamps(made.folder) == before
     assert not (tmp_path / ".work").exists()
 
     changed = replace(source, known={**source.known, IDS[0]: source.known[IDS[0]]._replace(content="second")})
-    assert not is_current(made, changed)
-    assert not is_current(made, replace(source, known=dict([*source.known.items()][1:])))
+    assert not is_up_to_date(made, changed)
+    assert not is_up_to_date(made, replace(source, known=dict([*source.known.items()][1:])))
     other = type(made)(tmp_path, made.options.model_copy(update={"name": "other"}))
-    assert not is_current(other, source)
+    assert not is_up_to_date(other, source)
     content = first.read_bytes()
     first.write_bytes(content[:-1] + b"?")
-    assert not is_current(made, source), "a damaged file"
+    assert not is_up_to_date(made, source), "a damaged file"
     first.unlink()
-    assert not is_current(made, source), "a missing file"
+    assert not is_up_to_date(made, source), "a missing file"
     (made.work / "0123456789abcdef").mkdir(parents=True)
     export(made, changed, loop)
-    assert is_current(made, changed)
+    assert is_up_to_date(made, changed)
     assert first.read_bytes() == content
     assert sorted(path.name for path in tmp_path.iterdir()) == [name, f"{name}.json"]

@@ -127,7 +127,7 @@ def test_a_finished_dataset_is_made_anew_only_where_that_was_allowed(
     assert not export.outdated(target, same)
     number = Rlds.recipe + 1
     monkeypatch.setattr(Rlds, "recipe", number)
-    assert not export.is_current(target, same)
+    assert not export.is_up_to_date(target, same)
     files = len(target.record().files)
     assert export.outdated(target, same) == {f"files, generated with recipe of rlds {number - 1}, here {number}": files}
     assert not export.outdated(target, episodes(content="other episodes")), "which somebody asked for"

@@ -79,7 +79,7 @@ def test_a_run_that_keeps_fewer_than_wanted_says_so_everywhere(
     sentence = f"{axis}: {kept[axis]} of {wanted} wanted episodes are kept"
     assert sentence in printed
     assert "plan.reserve" in printed
-    told = [part for part in status.told(Run(load(Path("configs/tiny.yaml")))) if isinstance(part, str)]
+    told = [part for part in status.describe(Run(load(Path("configs/tiny.yaml")))) if isinstance(part, str)]
     assert any(sentence in part for part in told)
     assert not any("all datasets are finished" in part for part in told)
     assert sentence in (clone / "data" / "tiny" / "report.html").read_text()
