@@ -1,4 +1,4 @@
-"""Measures of the observations in LIBERO's and LIBERO-Plus's evaluations, for `python -m pipeline analyze coverage`.
+"""Measures of the observations in LIBERO's and LIBERO-Plus's evaluations, for the command `analyze observations`.
 
     nice -n 10 python benchmarks/test_tasks_seen.py > pipeline/testset/seen.json
 

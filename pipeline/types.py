@@ -87,10 +87,10 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Task:
-    """One LIBERO task.
+    """One task of LIBERO or of the user.
 
     Attributes:
-        suite: ``libero_spatial``, ``libero_object``, ``libero_goal`` or ``libero_10``.
+        suite: one of LIBERO's five suites, or a suite of the user.
         name: LIBERO's task name, the stem of its BDDL file.
         instruction: the wording of LIBERO's task list, with which policies are prompted.
         bddl_file: the file that defines the scene and the goal.
@@ -110,7 +110,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Demo:
-    """One recorded human demonstration.
+    """One demonstration: recorded, expanded from another one, or from a program.
 
     Attributes:
         key: its name in its source, such as ``demo_0``.

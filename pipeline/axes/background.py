@@ -168,7 +168,8 @@ class BackgroundAxis(Axis):
     """Components and texture sources to sample from.
 
     Attributes:
-        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        levels: Levels to sample, 1 (weak) to 5 (strong), all five by default. Each entry has equal probability, except
+            for perturbations in own colours, which have level 5.
         components: Components to sample, each entry with equal probability; both by default. ``theme`` covers walls,
             floor and working surface, ``surface`` only the working surface.
         sources: Sources of textures; by default the three that setup installs: ``libero``, ``robosuite`` and

@@ -372,7 +372,8 @@ class PoseAxis(Axis):
     move and turn one object, sampled from the objects of the task that they can move.
 
     Attributes:
-        levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
+        levels: Levels to sample, 1 (weak) to 5 (strong), all five by default. Each entry has equal probability, except
+            for scenes with LIBERO-Plus's places, which have level 5.
         components: Components to sample: ``scene`` moves all objects, ``target`` an object that the task moves, and
             ``receptacle`` an object that receives it; ``scene`` by default.
         benchmark_places: Share of the goal suite's scenes in which three objects first get LIBERO-Plus's places, up to

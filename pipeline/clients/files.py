@@ -20,5 +20,4 @@ ROBOMIMIC_CONFIG = "robomimic.json"
 OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
 """Path of the statistics below the configuration's assets folder; the configuration reads it to serve a policy."""
 
-FILES = (RECIPE, OFT_SCRIPT, LEROBOT_TRAIN, STARVLA_CONFIG, ROBOMIMIC_CONFIG, str(OPENPI_ASSETS))
 """All names. Other files in the folder are foreign, and no stage and no command deletes them."""

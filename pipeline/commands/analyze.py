@@ -22,18 +22,19 @@ from pipeline.files import refuse_other_file, write_json
 analyze = LazyGroup(
     "analyze",
     help="Report on results of policies, and compare runs with the test tasks.",
-    epilog=example("analyze report results/act results/pi05", "analyze coverage configs/starter.yaml"),
+    epilog=example("analyze report results/act results/pi05", "analyze observations configs/starter.yaml"),
     sections={
         "Commands": {
             "report": Listed("analyze", "Write an HTML page and a JSON file about evaluations."),
             "table": Listed("analyze", "Print the paper's table, with policies next to published models."),
-            "coverage": Listed("analyze", "Compare the observations of a run with those of the test tasks."),
+            "observations": Listed("analyze", "Compare the observations of a run with those of the test tasks."),
             "gap": Listed("analyze", "Measure the compositional gap of pairs of perturbations."),
             "construct": Listed("analyze", "Sample and balance a benchmark of held-out perturbations."),
             "grade": Listed("analyze", "Grade the difficulty of tasks by the number of models that solve them."),
             "leakage": Listed("analyze", "Measure how close held-out perturbations come to a run's plan."),
         }
     },
+    moved={"coverage": "analyze observations"},
 )
 
 results_argument = click.argument("results", metavar="DIR", type=PATH, help="Folder of the results.")
@@ -95,9 +96,9 @@ def table(results: tuple[Path, ...], out: Path | None) -> None:
     print(json.dumps({"files": files, "rows": {row["name"]: row for row in found["evaluated"]}}))
 
 
-@click.command(cls=Command, epilog=example("analyze coverage configs/starter.yaml"))
+@click.command(cls=Command, epilog=example("analyze observations configs/starter.yaml"))
 @config_argument
-def coverage(config: Path) -> None:
+def observations(config: Path) -> None:
     """Compare the observations of a finished run with those of the benchmark's test tasks.
 
     The printed table has measures of each axis: first observations, displacements of hand and targets, places of added

@@ -60,8 +60,9 @@ def results(run: Run) -> dict[str, Path]:
 def status(config: Path) -> None:
     """Show the wanted and kept episodes of a run, the stages that would run and the reasons, disk and time.
 
-    The command changes no file in the folder of the run. If the plan is outdated, it samples a new one without storing
-    it, which may download textures or objects.
+    Before the first plan, only the wanted numbers and the disk are shown; `doctor` checks demonstrations, folder and
+    time. The command changes no file in the folder of the run. If the plan is outdated, it samples a new one without
+    storing it, which may download textures or objects.
     """
     from rich.console import Console
 

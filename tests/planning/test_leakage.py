@@ -315,13 +315,16 @@ def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -
     assert (some.not_compared, some.verdict) == (1, "disjoint where compared")
 
 
-def run_stage(folder: Path, rows: list[Row], **axes: dict[str, str]) -> subprocess.CompletedProcess[str]:
+def run_stage(
+    folder: Path, rows: list[Row], size_px: int = 256, **axes: dict[str, str]
+) -> subprocess.CompletedProcess[str]:
     """The stage as DVC runs it, on a plan of these rows, with other settings of some axes."""
     (folder / "data").mkdir(exist_ok=True)
     if not (folder / benchmark.FOLDER).exists():
         (folder / benchmark.FOLDER).symlink_to(FOLDER)
     config = tiny_config(folder / "demos")
     config["plan"]["axes"] |= axes
+    config["render"] |= {"size_px": size_px}
     (folder / "tiny.yaml").write_text(yaml.safe_dump(config))
     with chdir(folder):
         claim_folder(Path("tiny.yaml"))
@@ -344,7 +347,8 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     assert report["noise"]["smallest"] >= report["noise"]["clearance"]
 
     planted = row(task, [repeated(test.on(task, "language")[0])], "planted")
-    done = run_stage(tmp_path, [*clear, planted])
+    done = run_stage(tmp_path, [*clear, planted], size_px=128)
+    assert "noise: levels and distances are those of frames of 256 pixels, not of 128" in done.stdout
     assert done.returncode == 1
     clearance = f"clearance {LanguagePerturbation.clearance:g}"
     assert f"1 of 1 on the language axis (such as planted, distance 0, {clearance})" in done.stderr
@@ -360,6 +364,7 @@ def test_overlapping_cameras_are_reported_if_no_clearance_is_asked_for(test: Tes
     planted = row(find_task(tested.suite, tested.base), [repeated(tested)], "planted")
     done = run_stage(tmp_path, [planted])
     assert (done.returncode, "1 of 1 on the camera axis" in done.stderr) == (1, True)
+    assert "pixels" not in done.stdout
     done = run_stage(tmp_path, [planted], camera={"clear_by": "off"})
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
