@@ -1,7 +1,7 @@
 """Plan: a table with one row per candidate episode. All random numbers are sampled here, by key, never by position."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import count, islice
@@ -27,7 +27,7 @@ from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
 from pipeline.tables import read_table, write_table
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, is_in_tested_scene
 from pipeline.testset.own_tasks import reject_test_tasks
 from pipeline.types import Task
 
@@ -92,31 +92,44 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     rows: list[Row] = []
     for group in by_task.values():
         rows += twins(group, plan.seed, replay)
-    for name, episodes in plan.episodes.items():
-        draws = Draws(name, plan.axes_for(name), plan.seed, test)
-        groups = [group for group in by_task.values() if _all_apply(draws.axes, group[0].task)]
-        if not groups:
-            raise PipelineError(
-                "none of the selected tasks has a thing that these axes can change",
-                where=f"plan.episodes.{name}",
-                remedy="add tasks to demos.tasks, or remove the entry from plan.episodes",
-            )
-        by_suite = grouped((group[0].task.suite, group[0].task) for group in groups)
-        for axis in draws.axes:
-            for tasks in by_suite.values():
-                axis.refuse_tested(test, tasks[0])
-        # Each axis has its own order. Else small numbers of episodes would use the same tasks on all axes.
-        order = sorted(groups, key=lambda group: digest(plan.seed, name, group[0].task.suite, group[0].task.name))
-        ordered = [group[0].task for group in order]
-        weights = [plan.task_weights.get(str(task), 1.0) for task in ordered]
-        wanted_of = dict(zip(ordered, apportion(episodes, weights), strict=True))
-        for group in groups:
-            wanted = wanted_of[group[0].task]
-            dealt = sorted(group, key=lambda demo: digest(plan.seed, name, demo.demo_id))
-            candidates = islice(_candidates(draws, dealt), wanted + ceil(wanted * plan.reserve))
-            for rank, (demo, perturbations, variant) in enumerate(candidates):
-                candidate = row(demo, perturbations, plan.seed, replay)
-                rows.append(replace(candidate, rank=rank, variant=variant, wanted=rank < wanted))
+    for name in plan.episodes:
+        rows += _rows_of_entry(name, by_task, plan, replay, test)
+    return rows
+
+
+def _rows_of_entry(
+    name: str, by_task: Mapping[Task, Sequence[DemoEntry]], plan: PlanConfig, replay: ReplayConfig, test: TestSet
+) -> list[Row]:
+    """Sample the candidates of one entry of ``plan.episodes``, task by task.
+
+    Raises:
+        PipelineError: as ``make``, but for the user's tasks.
+    """
+    sampler = Sampler(name, plan.axes_for(name), plan.seed, test)
+    demos_of = {task: demos for task, demos in by_task.items() if _all_apply(sampler.axes, task)}
+    if not demos_of:
+        raise PipelineError(
+            "none of the selected tasks has a thing that these axes can change",
+            where=f"plan.episodes.{name}",
+            remedy="add tasks to demos.tasks, or remove the entry from plan.episodes",
+        )
+    # Tasks of one suite differ if the benchmark tests some of their scenes only.
+    alike = grouped(((task.suite, is_in_tested_scene(task)), task) for task in demos_of)
+    for axis in sampler.axes:
+        for tasks in alike.values():
+            axis.refuse_tested(test, tasks[0])
+    # Each axis has its own order. Else small numbers of episodes would use the same tasks on all axes.
+    ordered = sorted(demos_of, key=lambda task: digest(plan.seed, name, task.suite, task.name))
+    weights = [plan.task_weights.get(str(task), 1.0) for task in ordered]
+    wanted_of = dict(zip(ordered, apportion(plan.episodes[name], weights), strict=True))
+    rows: list[Row] = []
+    for task, demos in demos_of.items():
+        wanted = wanted_of[task]
+        shuffled = sorted(demos, key=lambda demo: digest(plan.seed, name, demo.demo_id))
+        candidates = islice(_candidates(sampler, shuffled), wanted + ceil(wanted * plan.reserve))
+        for rank, (demo, perturbations, variant) in enumerate(candidates):
+            candidate = row(demo, perturbations, plan.seed, replay)
+            rows.append(replace(candidate, rank=rank, variant=variant, wanted=rank < wanted))
     return rows
 
 
@@ -206,7 +219,7 @@ def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
     return {axis: wanted - planned[axis] for axis, wanted in plan.episodes.items() if wanted != planned[axis]}
 
 
-class Dealt:
+class TakenEntries:
     """Counts of the list entries that the candidates of one task have taken, for axes that take entries of lists.
 
     A candidate takes one of the entries that the fewest earlier candidates have; its key decides between them. All
@@ -218,7 +231,7 @@ class Dealt:
         """Start without any taken entry."""
         self._times: Counter[str] = Counter()
 
-    def in_turn(self, entries: Sequence[str], key: str) -> list[int]:
+    def order(self, entries: Sequence[str], key: str) -> list[int]:
         """Return the places of the entries in the order in which a candidate tries them; [0] for an empty list."""
         if not entries:
             return [0]
@@ -229,7 +242,7 @@ class Dealt:
 
         return sorted(range(len(entries)), key=rank)
 
-    def give(self, entries: Sequence[str], place: int) -> None:
+    def take(self, entries: Sequence[str], place: int) -> None:
         """Count the entry at ``place`` as taken by a candidate."""
         if entries:
             self._times[entries[place]] += 1
@@ -252,7 +265,7 @@ class _Choice(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Draws:
+class Sampler:
     """Source of perturbations for a plan's episodes of one axis or combination.
 
     Attributes:
@@ -268,12 +281,12 @@ class Draws:
     test: TestSet
 
     def sample(
-        self, demo_id: str, task: Task, dealt: Dealt | None = None, expanded_by: str = "[]"
+        self, demo_id: str, task: Task, taken: TakenEntries | None = None, expanded_by: str = "[]"
     ) -> Iterator[tuple[Perturbation, ...]]:
         """Sample for one demonstration, variant after variant: all different, and each at its clearance from all tests.
 
         Args:
-            dealt: list entries that other demonstrations of the task have taken; no entries by default.
+            taken: list entries that other demonstrations of the task have taken; no entries by default.
             expanded_by: JSON of the perturbations with which an expansion generated the demonstration.
 
         Yields:
@@ -283,13 +296,13 @@ class Draws:
             PipelineError: when another version with other perturbations generated the demonstration.
         """
         earlier = _earlier(demo_id, expanded_by)
-        dealt = dealt or Dealt()
+        taken = taken or TakenEntries()
         sampled: set[tuple[str, ...]] = set()
         for variant in count():
             key = (demo_id, variant)
             for attempt in range(_ATTEMPTS):
-                choices = self._choices(task, attempt, dealt, earlier, key)
-                perturbations = self._cleared(choices, (*key, attempt))
+                choices = self._sample_axes(task, attempt, taken, earlier, key)
+                perturbations = self._clear_all(choices, (*key, attempt))
                 content = tuple(perturbation.model_dump_json() for perturbation in perturbations or ())
                 if perturbations and content not in sampled:
                     break
@@ -297,18 +310,18 @@ class Draws:
                 return
             sampled.add(content)
             for choice in choices:
-                dealt.give(choice.axis.entries(choice.task), choice.place)
+                taken.take(choice.axis.entries(choice.task), choice.place)
             yield perturbations
 
-    def _choices(
-        self, task: Task, attempt: int, dealt: Dealt, earlier: Sequence[Perturbation], key: tuple[str | int, ...]
+    def _sample_axes(
+        self, task: Task, attempt: int, taken: TakenEntries, earlier: Sequence[Perturbation], key: tuple[str | int, ...]
     ) -> list[_Choice]:
         """Sample one perturbation of each axis, in the order in which they apply."""
         # One generator samples all first perturbations. Each axis that samples again uses a generator of its own.
         random = rng(self.seed, self.name, *key, attempt)
         choices: list[_Choice] = []
         for axis in self.axes:
-            turn = dealt.in_turn(axis.entries(task), digest(self.seed, self.name, *key))
+            turn = taken.order(axis.entries(task), digest(self.seed, self.name, *key))
             place = turn[attempt % len(turn)]
             perturbation = axis.sample(random, task, place).after(earlier)
             choices.append(_Choice(axis, task, earlier, place, perturbation))
@@ -317,7 +330,7 @@ class Draws:
                 earlier = ()
         return choices
 
-    def _cleared(self, choices: Sequence[_Choice], key: tuple[str | int, ...]) -> tuple[Perturbation, ...] | None:
+    def _clear_all(self, choices: Sequence[_Choice], key: tuple[str | int, ...]) -> tuple[Perturbation, ...] | None:
         """Return one perturbation of each choice, or ``None`` if an axis has none that passes ``_clear``."""
         texts = [choice.perturbation for choice in choices]
         instruction = " ".join(change.apply("") for change in texts if isinstance(change, TextPerturbation))
@@ -379,7 +392,9 @@ def _earlier(demo_id: str, expanded_by: str) -> tuple[Perturbation, ...]:
         ) from error
 
 
-def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:
+def _candidates(
+    sampler: Sampler, group: Sequence[DemoEntry]
+) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:
     """List a task's candidates: the first variant of every demonstration, then the second of every one, and so on.
 
     A demonstration without further different perturbations is skipped. The candidates end when all demonstrations are
@@ -388,16 +403,16 @@ def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[Demo
     Yields:
         Demonstration, perturbations and number of the variant.
     """
-    dealt = Dealt()
-    samplers = {demo: draws.sample(demo.demo_id, demo.task, dealt, demo.perturbations) for demo in group}
+    taken = TakenEntries()
+    samples = {demo: sampler.sample(demo.demo_id, demo.task, taken, demo.perturbations) for demo in group}
     for variant in count():
-        for demo, sampler in [*samplers.items()]:
-            perturbations = next(sampler, None)
+        for demo, of_demo in [*samples.items()]:
+            perturbations = next(of_demo, None)
             if perturbations is None:
-                del samplers[demo]
+                del samples[demo]
             else:
                 yield demo, perturbations, variant
-        if not samplers:
+        if not samples:
             return
 
 

@@ -25,7 +25,7 @@ from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import at_reset, first_look, replay, roll_out
-from pipeline.planning.plan import Draws
+from pipeline.planning.plan import Sampler
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
 from pipeline.rendering.renderer import LastScene, scene_of_process
@@ -195,7 +195,7 @@ def combinations(
             what = f"the axis {axis_name} cannot change the task {demo.task}"
             raise PipelineError(what, remedy="choose another task or another axis")
         axis.refuse_tested(test, demo.task)
-    draws = Draws(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
+    draws = Sampler(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
     left = list(islice(draws, CANDIDATES))
     chosen: list[tuple[Perturbation, ...]] = []
     count = PHYSICS_VARIANTS if left and of_layer(left[0], PhysicsPerturbation) else VARIANTS

@@ -30,7 +30,7 @@ from pipeline.evaluation.own_draws import PlannedDraws
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
-from pipeline.planning.plan import Draws, Row
+from pipeline.planning.plan import Row, Sampler
 from pipeline.run.claim import claim_folder
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -168,7 +168,7 @@ def test_scenes_are_drawn_clear_of_every_test_scene_and_cover_them_all(test: Tes
     axis, rows = PoseAxis(components=("scene",)), []
     for suite in SUITES[:4]:
         for task in tasks(suite):
-            draws = islice(Draws("pose", (axis,), 5, test).sample(task.name, task), 20)
+            draws = islice(Sampler("pose", (axis,), 5, test).sample(task.name, task), 20)
             rows += [row(task, drawn, f"{task.name}{number}") for number, drawn in enumerate(draws)]
     finding = leakage.check(rows, test)["pose"]
     assert (finding.rows, finding.overlaps, finding.verdict) == (800, 0, "disjoint")

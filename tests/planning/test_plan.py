@@ -203,7 +203,7 @@ def test_a_demonstration_that_has_no_more_draws_leaves_the_places_to_the_others(
     drawn = {
         demo.demo_id: {
             to_json(draw)
-            for draw in plan.Draws("background", (few,), wanted.seed, NO_TESTS).sample(demo.demo_id, demo.task)
+            for draw in plan.Sampler("background", (few,), wanted.seed, NO_TESTS).sample(demo.demo_id, demo.task)
         }
         for demo in demos
     }
@@ -237,7 +237,7 @@ def test_draws_that_overlap_with_a_test_task_are_drawn_anew() -> None:
 def test_levels_near_the_test_set_are_drawn_as_often_as_others() -> None:
     """Of level 1 here one scene in seven keeps clear of the benchmark's, of level 5 nearly each."""
     study = next(task for task in tasks("libero_10") if task.name.startswith("STUDY_SCENE1"))
-    draws = plan.Draws("pose", (PoseAxis(),), 3, benchmark.load()).sample("demo_0", study)
+    draws = plan.Sampler("pose", (PoseAxis(),), 3, benchmark.load()).sample("demo_0", study)
     levels = Counter(scene.level for (scene,) in islice(draws, 200))
     assert chisquare([levels[level] for level in LEVELS]).pvalue > 0.01
 
@@ -247,7 +247,7 @@ def test_a_rewrite_stays_where_what_is_beside_it_is_drawn_anew() -> None:
     axes = (CameraAxis(), LanguageAxis())
     of = ("camera+language", axes, 3)
     number = len(deal(TASKS[0]))
-    first = [*islice(plan.Draws(*of, NO_TESTS).sample("demo_0", TASKS[0]), number)]
+    first = [*islice(plan.Sampler(*of, NO_TESTS).sample("demo_0", TASKS[0]), number)]
     names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
     planted = [
         TestTask(
@@ -255,7 +255,7 @@ def test_a_rewrite_stays_where_what_is_beside_it_is_drawn_anew() -> None:
         )
         for camera, _ in first[::5]
     ]
-    again = [*islice(plan.Draws(*of, TestSet(tuple(planted))).sample("demo_0", TASKS[0]), number)]
+    again = [*islice(plan.Sampler(*of, TestSet(tuple(planted))).sample("demo_0", TASKS[0]), number)]
     assert sum(camera != other for (camera, _), (other, _) in zip(first, again, strict=True)) >= len(planted)
     assert [text for _, text in again] == [text for _, text in first]
     assert len({text for _, text in again}) == number
@@ -351,7 +351,7 @@ def test_a_combination_fills_a_quota_of_its_own() -> None:
     )
     assert {row.episode_id for row in alone} <= {row.episode_id for row in rows}
     drawn = [
-        next(plan.Draws(name, (CameraAxis(),), 3, NO_TESTS).sample("demo_0", TASKS[0]))
+        next(plan.Sampler(name, (CameraAxis(),), 3, NO_TESTS).sample("demo_0", TASKS[0]))
         for name in ("camera", "camera+noise")
     ]
     assert drawn[0] != drawn[1], "it has draws of its own"

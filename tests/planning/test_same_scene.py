@@ -14,7 +14,7 @@ from conftest import REPOSITORY
 
 from pipeline.axes.pose import PoseAxis, ScenePerturbation
 from pipeline.libero.tasks import find_task
-from pipeline.planning.plan import Draws
+from pipeline.planning.plan import Sampler
 from pipeline.testset import benchmark
 from pipeline.types import Floats, Task
 
@@ -69,7 +69,7 @@ def test_no_sample_of_a_plan_is_within_a_centimetre_of_the_other_tasks_tests(tas
     with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as archive:
         scenes = scenes_of_tests(archive)
     assert len(scenes) > 30
-    draws = Draws("pose", (PoseAxis(levels=(1,)),), 1, benchmark.load(FOLDER))
+    draws = Sampler("pose", (PoseAxis(levels=(1,)),), 1, benchmark.load(FOLDER))
     within = 0
     for (drawn,) in islice(draws.sample(task.name, task), 200):
         assert isinstance(drawn, ScenePerturbation)
