@@ -54,6 +54,7 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
     names = {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes", "axes_relative", "object", "spatial"}
+    names.add("focus_object")
     assert further.keys() == names
     axes, relative = further.pop("axes"), further.pop("axes_relative")
     assert relative == axes.model_copy(update={"arms": relative.arms, "training": relative.training})
@@ -78,6 +79,12 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
         assert group.training == axes.training.model_copy(update={"steps": 8_000})
         same = {"demos": {"tasks"}}
         assert group.run.model_dump(exclude=same) == groups[0].run.model_dump(exclude=same)
+    focused = further.pop("focus_object")
+    same = {"further": focused.further, "decisions": focused.decisions}
+    assert focused == groups[0].model_copy(update=same)
+    by_failures, uniform = (focused.further[arm] for arm in ("focus", "uniform"))
+    assert (by_failures.episodes, uniform.episodes, by_failures.arm, uniform.arm) == (100, 100, "all", "all")
+    assert focused.dataset_name("all") == groups[0].dataset_name("all")
     goals, many = further.pop("goals"), further.pop("goals_many")
     assert many == goals.model_copy(update={"data": many.data, "arms": many.arms, "decisions": many.decisions})
     same = {"plan": {"episodes"}}
