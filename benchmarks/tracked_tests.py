@@ -16,7 +16,7 @@ from itertools import chain, repeat
 import numpy as np
 
 from pipeline.config import ReplayConfig
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
@@ -69,7 +69,7 @@ def solve(environment: EpisodeEnvironment, test: EvaluationTask) -> str:
         for action in chain(tracked, repeat(resting, REST_STEPS)):
             if environment.step(action).over:
                 break
-    except RefusedError as error:
+    except RejectedError as error:
         return error.reason
     return "success" if environment.progress.success else "goal_not_reached"
 

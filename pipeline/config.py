@@ -72,7 +72,7 @@ class DemosConfig(Frozen):
         """Return the usable demonstrations of the selected tasks, and the problems of unusable ones."""
         return self.open().index(select_tasks(self.tasks), self.per_task)
 
-    def refuse_tasks_without(self, entries: Sequence[DemoEntry]) -> None:
+    def reject_tasks_without(self, entries: Sequence[DemoEntry]) -> None:
         """Reject selected tasks without any of ``entries``.
 
         Other tasks would be planned in their place, and their finished work would be deleted.
@@ -324,7 +324,7 @@ class Config(Frozen):
     def _named(cls, export: ExportConfig, info: ValidationInfo) -> ExportConfig:
         named = export.named(f"libero_{info.data.get('name', '')}")
         for options in named.formats.values():
-            options.refuse_name()
+            options.reject_name()
         return named
 
     @model_validator(mode="after")
@@ -377,7 +377,7 @@ class Config(Frozen):
     @model_validator(mode="after")
     def _formats_hold_the_content(self) -> Config:
         for options in self.export.formats.values():
-            options.refuse_content(self.render.content)
+            options.reject_content(self.render.content)
         return self
 
     @model_validator(mode="after")

@@ -31,7 +31,7 @@ class PipelineError(Exception):
         return partial(PipelineError, self.what, where=where, expected=self.expected, remedy=self.remedy), ()
 
 
-class RefusedError(Exception):
+class RejectedError(Exception):
     """A perturbation that is rejected in its scene.
 
     Args:

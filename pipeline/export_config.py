@@ -140,7 +140,7 @@ class ExportConfig(_Formats):
             formats[format_name] = options.model_copy(update=changes)
         return self.model_copy(update=formats)
 
-    def refuse_too_few(self, demonstrations: Mapping[str, int]) -> None:
+    def reject_too_few(self, demonstrations: Mapping[str, int]) -> None:
         """Reject a validation split that would stay empty.
 
         Args:

@@ -90,7 +90,7 @@ def write(file: Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def refuse_other_file(path: Path, mark: str) -> None:
+def reject_other_file(path: Path, mark: str) -> None:
     """Reject a file that a command would overwrite and did not write itself.
 
     Args:

@@ -145,7 +145,7 @@ def edits_in_words(data: Path) -> Iterator[str]:
             yield f"edited files in {data / name}: {words}. A run stops before it overwrites them: {REMEDY}"
 
 
-def refuse_edits(data: Path) -> None:
+def reject_edits(data: Path) -> None:
     """Stop before the generated folders of a run are deleted with edits in them.
 
     Raises:

@@ -12,7 +12,7 @@
 8. A file is named after its inputs, and is up to date if it has today's fingerprint. Else it counts as missing.
 9. A stage with few outputs (an export, ``validate``, ``summary``) has one record of all its inputs and outputs.
    The record (``pipeline/record.py``) also states why work is not up to date.
-10. Before finished files of today's plan are generated again, a person must allow it (``refuse_unasked``).
+10. Before finished files of today's plan are generated again, a person must allow it (``reject_unasked``).
 """
 
 import os
@@ -133,7 +133,7 @@ ALLOW = f"put `{REMAKE}=1` before the command, or --remake after the command of 
 """Ways to allow that a stage generates finished files again, in words."""
 
 
-def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
+def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
     """Report the finished files that would be generated again, and stop unless a person allowed it.
 
     Args:

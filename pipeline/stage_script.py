@@ -17,7 +17,7 @@ def perform_stage(script: str) -> None:
     from pipeline.exit_status import exit_status
     from pipeline.formats.registry import GROUPS
     from pipeline.identity import REMAKE
-    from pipeline.run.claim import claim_folder, locked, refuse_other_folder
+    from pipeline.run.claim import claim_folder, locked, reject_other_folder
     from pipeline.run.run import Run
     from pipeline.stages import STAGES, perform
 
@@ -31,7 +31,7 @@ def perform_stage(script: str) -> None:
         os.environ[REMAKE] = "1"
 
     def work() -> int:
-        refuse_other_folder(arguments.config)
+        reject_other_folder(arguments.config)
         config = claim_folder(arguments.config)
         with locked(config.data):
             for name in names:

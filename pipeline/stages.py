@@ -23,13 +23,13 @@ from pipeline.files import read_json, write, write_json
 from pipeline.formats import exact_statistics, registry
 from pipeline.formats.episodes import by_suite
 from pipeline.formats.rlds import Rlds
-from pipeline.identity import refuse_unasked
+from pipeline.identity import reject_unasked
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
 from pipeline.run.claim import claim_folder, locked
 from pipeline.run.cleaning import say_stale
 from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
-from pipeline.run.foreign import refuse_foreign_files
+from pipeline.run.foreign import reject_foreign_files
 from pipeline.run.layout import (
     CARD,
     COUNTS,
@@ -119,7 +119,7 @@ def doctor(run: Run) -> None:
 def make_plan(run: Run) -> None:
     """Sample every perturbation of the run and write the plan, one row for each wanted episode and each reserve."""
     rows = plan_stage.make(run.config)
-    dropped.refuse_deletion(rows, run)
+    dropped.reject_deletion(rows, run)
     for axis, number in plan.shortage(rows, run.config.plan).items():
         print(
             f"{axis}: {number} of {run.config.plan.episodes[axis]} wanted episodes cannot be planned, because no "
@@ -150,15 +150,15 @@ def check_leakage(run: Run) -> None:
     for name, axis in run.config.plan.axes.configured().items():
         if not axis.keeps_clearance:
             findings.pop(name, None)
-    leakage.refuse_overlap(findings)
+    leakage.reject_overlap(findings)
 
 
 def replay(run: Run) -> None:
     """Replay and judge every planned trajectory, without OpenGL; a stopped stage resumes."""
     rows, config = run.plan, run.config
-    plan.refuse_other_settings(rows, config.replay)
-    refuse_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
-    dropped.refuse_deletion(rows, run)
+    plan.reject_other_settings(rows, config.replay)
+    reject_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
+    dropped.reject_deletion(rows, run)
     with run.workers() as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
         verdicts = replays.complete(rows)
@@ -176,11 +176,11 @@ def render(run: Run) -> None:
     """
     print(gl.choose())
     rows, config = run.plan, run.config
-    plan.refuse_other_settings(rows, config.replay)
-    refuse_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
-    dropped.refuse_deletion(rows, run)
+    plan.reject_other_settings(rows, config.replay)
+    reject_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
+    dropped.reject_deletion(rows, run)
     # The configuration may have changed since the plan was written.
-    config.export.refuse_too_few(plan.demonstrations(rows))
+    config.export.reject_too_few(plan.demonstrations(rows))
     replayed = int(read_json(run.path(REPLAY))["replayed"])
     with run.workers(renders=True) as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
@@ -408,7 +408,7 @@ def perform(name: str, run: Run, title: str = "") -> None:
     print(title or name, flush=True)
     if reason not in (EVERY_TIME, finished.NO_RECORD):
         print(f"  reason: {reason}", flush=True)
-    refuse_foreign_files(run.folder)
+    reject_foreign_files(run.folder)
     STAGES[name].work(run)
     after = _memory(name, Run(run.config))
     if after is not None:

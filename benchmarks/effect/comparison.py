@@ -119,7 +119,7 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
             pairs: list[Pair] = []
             for seed in sorted(seeds):
                 rows_of_first, rows_of_second = episodes[first][seed], episodes[second][seed]
-                _refuse_different_tests(rows_of_first, rows_of_second, f"{first} and {second}", line)
+                _reject_different_tests(rows_of_first, rows_of_second, f"{first} and {second}", line)
                 pairs += paired(rows_of_first, rows_of_second)
             if pairs:
                 measured = compare(pairs)["all"]["difference"]
@@ -130,7 +130,7 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
     return compared
 
 
-def _refuse_different_tests(
+def _reject_different_tests(
     first: Sequence[EpisodeResult], second: Sequence[EpisodeResult], arms: str, line: str
 ) -> None:
     """Raise a ``PipelineError`` if the episodes of two arms on a line do not belong to the same tests."""

@@ -72,7 +72,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
     rows, chosen = planned(experiment, arm, demos)
     for row in chosen:
         vector(row.instruction, vectors)
-    leakage.refuse_overlap(leakage.check(rows, benchmark.load()))
+    leakage.reject_overlap(leakage.check(rows, benchmark.load()))
     folder, run = file.with_suffix(""), experiment.run
     folder.mkdir(parents=True, exist_ok=True)
     plan.write(rows, folder / PLAN)

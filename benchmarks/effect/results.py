@@ -89,7 +89,7 @@ def read(folder: Path) -> list[PolicyResults]:
         columns, common = content.pop("columns"), content.pop("common")
         rows = [EpisodeResult(**common, **dict(zip(columns, row, strict=True))) for row in content.pop("rows")]
         policies.append(PolicyResults(**content, rows=rows))
-        _refuse_different(policies[0], policies[-1], policies[0].made_by(), file)
+        _reject_different(policies[0], policies[-1], policies[0].made_by(), file)
     if not policies:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")
     settings = policies[0].settings
@@ -107,11 +107,11 @@ def join(first: Sequence[PolicyResults], second: Sequence[PolicyResults], where:
         PipelineError: if sentences, packages or versions differ.
     """
     for policy in second:
-        _refuse_different(first[0], policy, ("sentences", "packages", "packages of the training", "versions"), where)
+        _reject_different(first[0], policy, ("sentences", "packages", "packages of the training", "versions"), where)
     return [*first, *second]
 
 
-def _refuse_different(first: PolicyResults, second: PolicyResults, names: Iterable[str], where: Path) -> None:
+def _reject_different(first: PolicyResults, second: PolicyResults, names: Iterable[str], where: Path) -> None:
     """Raise a ``PipelineError`` if two policies differ in a setting or version of ``made_by``."""
     made_by_first, made_by_second = first.made_by(), second.made_by()
     for name in names:

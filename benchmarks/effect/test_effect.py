@@ -80,8 +80,8 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
         same = {"demos": {"tasks"}}
         assert group.run.model_dump(exclude=same) == groups[0].run.model_dump(exclude=same)
     focused = further.pop("focus_object")
-    same = {"further": focused.further, "decisions": focused.decisions}
-    assert focused == groups[0].model_copy(update=same)
+    added = {"further": focused.further, "decisions": focused.decisions}
+    assert focused == groups[0].model_copy(update=added)
     by_failures, uniform = (focused.further[arm] for arm in ("focus", "uniform"))
     assert (by_failures.episodes, uniform.episodes, by_failures.arm, uniform.arm) == (100, 100, "all", "all")
     assert focused.dataset_name("all") == groups[0].dataset_name("all")

@@ -236,7 +236,7 @@ class Axis(Frozen):
         """Return whether perturbations keep their clearance to the test tasks."""
         return True
 
-    def refuse_tested(self, test: TestSet, task: Task) -> None:
+    def reject_tested(self, test: TestSet, task: Task) -> None:
         """Reject levels without any perturbation that keeps its clearance, as far as the ranges show this.
 
         Otherwise, perturbations of other levels would silently take their place in a plan.
@@ -402,7 +402,7 @@ class PhysicsPerturbation(Perturbation):
             roll_out: returns the states that the demonstration's actions lead to from a scene; costs a whole replay.
 
         Raises:
-            RefusedError: when the change is impossible in this scene; its reason is written into the manifest.
+            RejectedError: when the change is impossible in this scene; its reason is written into the manifest.
         """
         raise NotImplementedError
 

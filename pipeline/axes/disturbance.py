@@ -13,7 +13,7 @@ from pydantic import Field
 from pipeline.axes.base import Axis, ByLevel, Intervals, PhysicsPerturbation, pick
 from pipeline.axes.report_data import ObservedEpisode
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero.starts import kept_actions
 from pipeline.types import Demo, Floats, Push, RollOut, Scene, Task
 
@@ -63,11 +63,11 @@ class DisturbancePerturbation(PhysicsPerturbation):
         Steps are counted in the demonstration without its no-ops, as it is replayed by default.
 
         Raises:
-            RefusedError: when ``fault_of`` returns a reason for the demonstration's own actions.
+            RejectedError: when ``fault_of`` returns a reason for the demonstration's own actions.
         """
         fault = self.fault_of(demo.actions[kept_actions(demo.actions, "drop")])
         if fault:
-            raise RefusedError(fault)
+            raise RejectedError(fault)
         push = Push(self.body, self.wrench, self.first_step, self.steps)
         return replace(scene, push=push, resolved={**scene.resolved, "disturbance": push._asdict()})
 

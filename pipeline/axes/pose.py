@@ -156,7 +156,7 @@ class PosePerturbation(_PosePerturbation):
         """Return the scene with the object moved; its height and velocity and all other things stay as they are.
 
         Raises:
-            RefusedError: see ``pipeline.scenes.moving.move_one``.
+            RejectedError: see ``pipeline.scenes.moving.move_one``.
         """
         from pipeline.scenes.moving import move_one
 
@@ -244,7 +244,7 @@ class ScenePerturbation(_PosePerturbation):
         """Return the scene with all things moved; heights, rotations, velocities and joints stay as they are.
 
         Raises:
-            RefusedError: see ``pipeline.scenes.moving.move``.
+            RejectedError: see ``pipeline.scenes.moving.move``.
         """
         from pipeline.scenes.moving import move
 

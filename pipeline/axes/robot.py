@@ -21,7 +21,7 @@ from pipeline.axes.report_data import (
     ObservedEpisode,
     Strips,
 )
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero.starts import HOME_RAD
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
@@ -68,7 +68,7 @@ class RobotPerturbation(PhysicsPerturbation):
         """Return the scene with the arm turned and at rest, or with the controller's posture, otherwise unchanged.
 
         Raises:
-            RefusedError: ``joint_limit``: a joint comes too near its limit.
+            RejectedError: ``joint_limit``: a joint comes too near its limit.
                 ``robot_in_collision``: the robot touches a thing that it did not touch before.
                 ``test_posture``: recorded start and offset happen to add up to a posture of the test set.
         """
@@ -83,9 +83,9 @@ class RobotPerturbation(PhysicsPerturbation):
         posture = (scene.posture_rad if pulled else data.qpos[arm]) + np.array(self.joint_offsets_rad)
         low, high = np.array([joint.range for joint in joints]).T
         if (posture < low + LIMIT_MARGIN_RAD).any() or (posture > high - LIMIT_MARGIN_RAD).any():
-            raise RefusedError("joint_limit")
+            raise RejectedError("joint_limit")
         if np.linalg.norm(HOME_RAD + benchmark_offsets_rad() - posture, axis=1).min() < self.clearance:
-            raise RefusedError("test_posture")
+            raise RejectedError("test_posture")
         data.qpos[arm] = posture
         data.qvel[[joint.dofadr[0] for joint in joints]] = 0.0
         state = compiled.state
@@ -97,7 +97,7 @@ class RobotPerturbation(PhysicsPerturbation):
             pulled_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
             return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": pulled_to})
         if compiled.touching().keys() - before:
-            raise RefusedError("robot_in_collision")
+            raise RejectedError("robot_in_collision")
         resolved = {**scene.resolved, "robot": {"joints_rad": posture.tolist()}}
         return replace(scene, state=state, posture_rad=None, resolved=resolved)
 

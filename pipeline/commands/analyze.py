@@ -17,7 +17,7 @@ from pipeline.commands.base import (
     result_paths_argument,
 )
 from pipeline.errors import PipelineError
-from pipeline.files import refuse_other_file, write_json
+from pipeline.files import reject_other_file, write_json
 
 analyze = LazyGroup(
     "analyze",
@@ -89,7 +89,7 @@ def table(results: tuple[Path, ...], out: Path | None) -> None:
 
     if out is not None:
         out = out.with_suffix("") if out.suffix in paper_rows.MARKS else out
-        paper_rows.refuse_other_tables(out)
+        paper_rows.reject_other_tables(out)
     found = table_of(read_tested(results))
     print(paper_rows.markdown(found))
     files = [] if out is None else [str(file) for file in paper_rows.write_table(found, out)]
@@ -135,8 +135,8 @@ def gap(results: Path) -> None:
     from pipeline.evaluation.results import stored
 
     picture, findings = results / "gap.png", results / "gap.json"
-    refuse_other_file(picture, composition.TITLE)
-    refuse_other_file(findings, "papers_chi_square")
+    reject_other_file(picture, composition.TITLE)
+    reject_other_file(findings, "papers_chi_square")
     measured = composition.pairs(stored([results]))
     composition.heatmap(measured, picture)
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
@@ -172,9 +172,9 @@ def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on
     """
     from pipeline.evaluation import own_draws, selection
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.task_list import refuse_other_list, write_tasks
+    from pipeline.evaluation.task_list import reject_other_list, write_tasks
 
-    refuse_other_list(out)
+    reject_other_list(out)
     rows = [row for row, _ in stored(results)]
     plan = own_draws.planned(open_run(trained_on).plan_file) if trained_on else None
     candidates = selection.candidates(seed)
@@ -194,9 +194,9 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
     """
     from pipeline.evaluation import statistics
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.task_list import refuse_other_list, write_tasks
+    from pipeline.evaluation.task_list import reject_other_list, write_tasks
 
-    refuse_other_list(out)
+    reject_other_list(out)
     results = [stored([folder]) for folder in folders]
     seeds: set[int] = set()
     for results_of_model in results:

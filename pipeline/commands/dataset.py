@@ -132,7 +132,7 @@ def compare_frame(picture: Path, task: str, init_state: int, view: str, sheet: P
     from pipeline.libero.tasks import find_task, select_tasks
 
     if sheet is not None:
-        frame_report.refuse_existing(sheet)
+        frame_report.reject_existing(sheet)
     suite, _, name = task.partition("/")
     found = find_task(suite, name) if name else select_tasks([task])[0]
     with closing(LastStartFrames()) as opened:

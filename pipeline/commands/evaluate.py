@@ -112,7 +112,7 @@ def evaluate(
     settings = EpisodeSettings.model_validate(given(options, EpisodeSettings) | plan)
     evaluation = Evaluation(settings, config, config.identity(), out, videos=videos, archive=assets)
     table_path = out / "paper_table"
-    paper_rows.refuse_other_tables(table_path)
+    paper_rows.reject_other_tables(table_path)
     number = workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if number == 1 else "local", workers=number)
     with runner(compute, out, renders=True) as pool:

@@ -126,14 +126,14 @@ def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
 
     from pipeline import gl
     from pipeline.config import Config
-    from pipeline.files import refuse_other_file, replaced
+    from pipeline.files import reject_other_file, replaced
     from pipeline.libero.tasks import select_tasks
     from pipeline.report import preview
     from pipeline.testset import benchmark
 
     settings = load_config(config) if config else Config.model_validate(DEFAULTS)
     chosen = select_tasks([task])
-    refuse_other_file(out, PREVIEW)
+    reject_other_file(out, PREVIEW)
     gl.choose()  # Without a working renderer, stop before slow work.
     stage = preview.staged(chosen, settings)
     with replaced(out) as temporary:

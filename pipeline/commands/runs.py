@@ -100,7 +100,7 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     from pipeline.run import claim, cleaning
 
     run = open_run(config)
-    claim.refuse_unmarked(run.folder)
+    claim.reject_unmarked(run.folder)
     size_of_part = cleaning.found(run, only or tuple(cleaning.PARTS))
     if not size_of_part:
         print(f"{run.folder} has no files of these parts")
@@ -108,7 +108,7 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     for part, size_mb in size_of_part.items():
         print(f"{size_mb:10.1f} MB  {part:<13} generated again by {cleaning.PARTS[part].made_by}")
     print(f"{sum(size_of_part.values()):10.1f} MB  in all, of {run.folder}")
-    cleaning.refuse_foreign(run, size_of_part)
+    cleaning.reject_foreign(run, size_of_part)
     if not yes:
         if not sys.stdin.isatty():
             raise PipelineError("nothing was deleted, because there is no terminal to ask in", remedy="add --yes")

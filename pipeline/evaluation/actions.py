@@ -44,7 +44,7 @@ FORMATS = {
 """Part of an action to the formats that can be executed, in vla-eval's names; ``raw`` leaves the format open."""
 
 
-def refuse_other_actions(
+def reject_other_actions(
     params: Mapping[str, Any], spec: Mapping[str, Mapping[str, Any]], server: str, actions: Actions
 ) -> None:
     """Reject a model server with other actions than the evaluation executes, or with another gripper command.

@@ -35,8 +35,8 @@ from pipeline.evaluation.results import (
     EpisodeResult,
     Stored,
     one_setting,
-    refuse_different,
-    refuse_repeated_tasks,
+    reject_different,
+    reject_repeated_tasks,
 )
 from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
@@ -143,8 +143,8 @@ def pairs(results: Iterable[Stored]) -> list[Pair]:
     """
     of_pairs = [(row, files) for row, files in results if row.source in ("libero", "own") and row.reason != REFUSED]
     one_setting(of_pairs)
-    refuse_different(of_pairs)
-    refuse_repeated_tasks(of_pairs)
+    reject_different(of_pairs)
+    reject_repeated_tasks(of_pairs)
     rows = [row for row, _ in of_pairs]
     # The combinations of a trial share suite, LIBERO task and number of the initial state.
     combined = {(row.axis, row.level, (row.suite, row.base, row.number)): row for row in rows}

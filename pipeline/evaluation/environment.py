@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import AXES, Perturbation
 from pipeline.axes.base import Frozen
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import PipelineError, RejectedError
 from pipeline.evaluation import libero_plus, own_draws
 from pipeline.evaluation.actions import Actions, checked_actions
 from pipeline.evaluation.policies import VIEWS, StateAngle, Wanted
@@ -163,7 +163,7 @@ class EpisodeEnvironment:
         try:
             starts.get(task.source, self._start_libero)()
             self.progress = Progress(reason="running")
-        except RefusedError as error:
+        except RejectedError as error:
             self.progress = Progress(reason=REFUSED if task.source == "own" else error.reason)
         return self.progress
 
@@ -190,7 +190,7 @@ class EpisodeEnvironment:
             self.simulator.step(given, absolute=self.settings.actions == "absolute")
             limited = "step_limit" if steps >= self.step_limit else "running"
             self.progress = Progress(steps, "success" if self.simulator.succeeded() else limited)
-        except RefusedError as error:
+        except RejectedError as error:
             self.progress = Progress(steps, error.reason)
         return self.progress
 

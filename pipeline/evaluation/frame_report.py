@@ -160,7 +160,7 @@ def compare_frame(
     return Report(_raw_difference(picture, found.expected), findings, found)
 
 
-def refuse_existing(file: Path) -> None:
+def reject_existing(file: Path) -> None:
     """Reject a file that exists, which ``write_sheet`` would replace.
 
     Raises:
@@ -178,7 +178,7 @@ def write_sheet(report: Report, file: Path) -> None:
     Raises:
         PipelineError: if the file exists.
     """
-    refuse_existing(file)
+    reject_existing(file)
     match = report.found.match
     picture = resized(match.variant.pixels, SIZE_PX, SIZE_PX)
     apart = np.abs(picture.astype(np.int16) - match.frame.astype(np.int16))

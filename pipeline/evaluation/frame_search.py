@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.evaluation.picture_fit import Fit, Smooth, Variant, fit, smoothed, variants
 from pipeline.evaluation.picture_points import place
 from pipeline.evaluation.simulator import SETTLING_STEPS
@@ -213,7 +213,7 @@ def _matches(like: Match, frames: StartFrames, starts: Iterable[Start]) -> Itera
     for start in starts:
         try:
             frame = frames.render(start, [like.camera], like.srgb)[like.camera]
-        except RefusedError:
+        except RejectedError:
             continue
         yield replace(like, start=start, frame=frame, fit=fit(like.variant.smooth, frame))
 

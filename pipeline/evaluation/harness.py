@@ -23,7 +23,7 @@ from vla_eval.specs import (
 
 from pipeline import gl
 from pipeline.errors import PipelineError
-from pipeline.evaluation.actions import checked_actions, refuse_other_actions
+from pipeline.evaluation.actions import checked_actions, reject_other_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import check_settings, not_trained
 from pipeline.evaluation.policies import NextLook, Wanted, is_shortest
@@ -90,7 +90,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         given |= {} if env_seed is None else {"fixture_seed": env_seed}
         self._archive = None if assets is None else Path(assets)
         episodes = EpisodeSettings.model_validate(given | (settings or {}))
-        refuse_other_actions({"absolute_action": absolute_action}, {}, "model server", episodes.actions)
+        reject_other_actions({"absolute_action": absolute_action}, {}, "model server", episodes.actions)
         self._environment = EpisodeEnvironment(episodes, self._archive)
         self._evaluation: Evaluation | None = None
         if out is not None:

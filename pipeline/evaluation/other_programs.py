@@ -156,7 +156,7 @@ def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
                 expected="results of `evaluate --source libero_plus`",
             )
         policies = [*evaluated, *policies]
-    _refuse_shared_names(policies, paths)
+    _reject_shared_names(policies, paths)
     return policies
 
 
@@ -180,11 +180,11 @@ def separate(paths: Sequence[Path]) -> tuple[list[Path], list[TestedPolicy]]:
             policies.append(_policy(lerobot.parent, "lerobot-eval", _lerobot_episodes(lerobot)))
         else:
             folders.append(path)
-    _refuse_shared_names(policies, paths)
+    _reject_shared_names(policies, paths)
     return folders, policies
 
 
-def _refuse_shared_names(policies: Sequence[TestedPolicy], paths: Sequence[Path]) -> None:
+def _reject_shared_names(policies: Sequence[TestedPolicy], paths: Sequence[Path]) -> None:
     repeated = [name for name, count in Counter(policy.name for policy in policies).items() if count > 1]
     if repeated:
         raise PipelineError(

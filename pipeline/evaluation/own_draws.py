@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline import seeding
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json, task_of, to_json
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import PipelineError, RejectedError
 from pipeline.evaluation import held_out_sight
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
@@ -106,7 +106,7 @@ def drawn_scene(
         The perturbations in the order in which they apply, and the scene; `None` if physics stay LIBERO's.
 
     Raises:
-        RefusedError: if the scene accepts no perturbation of an axis, or rejects the perturbations of several axes
+        RejectedError: if the scene accepts no perturbation of an axis, or rejects the perturbations of several axes
             together.
     """
     perturbations: list[Perturbation] = []
@@ -121,7 +121,7 @@ def drawn_scene(
     if len(perturbations) > 1 and any(change.can_hide for change in perturbations):
         fault = held_out_sight.fault(scene or nominal(), demo, perturbations, opened)
         if fault:
-            raise RefusedError(fault)
+            raise RejectedError(fault)
     return tuple(perturbations), scene
 
 
@@ -131,13 +131,13 @@ def _first_accepted(
     """Return the first perturbation that its scene accepts, and the scene with this perturbation alone.
 
     Raises:
-        RefusedError: if the scene accepts no perturbation.
+        RejectedError: if the scene accepts no perturbation.
     """
     for perturbation in samples:
         scene = _scene_with(perturbation, demo, nominal, opened)
         if scene is not None:
             return perturbation, scene
-    raise RefusedError(f"no_{axis}_draw_fits")
+    raise RejectedError(f"no_{axis}_draw_fits")
 
 
 def _scene_with(
@@ -148,7 +148,7 @@ def _scene_with(
     if isinstance(perturbation, PhysicsPerturbation):
         try:
             scene = perturbation.apply(scene, demo, roll_out)
-        except RefusedError:
+        except RejectedError:
             return None
     if perturbation.can_hide and held_out_sight.fault(scene, demo, (perturbation,), opened):
         return None

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.evaluation.actions import Actions, PolicyError, checked_actions, refuse_other_actions
+from pipeline.evaluation.actions import Actions, PolicyError, checked_actions, reject_other_actions
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum
 from pipeline.images.jpeg import resized
@@ -209,7 +209,7 @@ class Server:
         wanted = announced.get("observation_params") or {}
         self.states_request = any(name in wanted for name in REQUESTS)
         try:
-            refuse_other_actions(wanted, announced.get("action_spec") or {}, self.name, self._actions)
+            reject_other_actions(wanted, announced.get("action_spec") or {}, self.name, self._actions)
         except PipelineError:
             self.close()
             raise
@@ -364,7 +364,7 @@ class Checkpoint:
             config.device = "cpu"
         weights = _weights_of(folder)
         self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
-        _refuse_other_weights(self._policy.state_dict(), weights)
+        _reject_other_weights(self._policy.state_dict(), weights)
         self._policy.eval()
         self._before, self._after = make_pre_post_processors(
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
@@ -422,7 +422,7 @@ def _weights_of(folder: Path) -> Path:
     return file
 
 
-def _refuse_other_weights(loaded: Mapping[str, Any], file: Path) -> None:
+def _reject_other_weights(loaded: Mapping[str, Any], file: Path) -> None:
     """Compare some tensors of the loaded policy, evenly chosen by name, with those of the checkpoint.
 
     lerobot's pi0.5 prints a line and keeps random weights if it fails to load them (huggingface/lerobot#4577).

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from pipeline.compute.slurm import LOGS
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
-from pipeline.files import is_temporary, read_json, refuse_other_file, write
+from pipeline.files import is_temporary, read_json, reject_other_file, write
 from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
@@ -95,13 +95,13 @@ class EpisodeFiles:
         """Return the path of an episode's video."""
         return self.folder / "videos" / f"{episode}.mp4"
 
-    def refuse_other_folder(self) -> None:
+    def reject_other_folder(self) -> None:
         """Reject a folder with files but without results, such as a checkpoint's, and another program's summary.
 
         Raises:
             PipelineError: if the folder is rejected; it names the folder or the file.
         """
-        refuse_other_file(self.folder / "summary.json", '"by_axis": ')
+        reject_other_file(self.folder / "summary.json", '"by_axis": ')
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
         # Workers of a cluster write log files into the folder. An evaluation without results writes its summary.
@@ -192,7 +192,7 @@ def one_setting(results: Sequence[Stored]) -> dict[str, Any]:
     return results[0][0].settings if results else {}
 
 
-def refuse_different(results: Iterable[Stored], across: Collection[str] | None = None) -> None:
+def reject_different(results: Iterable[Stored], across: Collection[str] | None = None) -> None:
     """Reject results that cannot be compared.
 
     In each suite of each source, results must have equal prompts, step limits, actions, black views and starts.
@@ -219,7 +219,7 @@ def refuse_different(results: Iterable[Stored], across: Collection[str] | None =
     )
 
 
-def refuse_repeated_tasks(results: Iterable[Stored]) -> None:
+def reject_repeated_tasks(results: Iterable[Stored]) -> None:
     """Reject two episodes of one task among results of one policy under one set of settings.
 
     Raises:
@@ -233,7 +233,7 @@ def refuse_repeated_tasks(results: Iterable[Stored]) -> None:
     )
 
 
-def refuse_repeated_models(results: Sequence[Sequence[Stored]]) -> None:
+def reject_repeated_models(results: Sequence[Sequence[Stored]]) -> None:
     """Reject one model in the place of two.
 
     Args:
@@ -255,7 +255,7 @@ def refuse_repeated_models(results: Sequence[Sequence[Stored]]) -> None:
         folder_of[row.identity] = files.folder
 
 
-def refuse_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
+def reject_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
     """Reject two policies with one name.
 
     Args:
@@ -343,8 +343,8 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
             a task has one episode under the same settings, and policies have different names.
     """
     results = stored(folders)
-    refuse_shared_names((row.policy, row.identity, files.folder) for row, files in results)
-    refuse_different(results, across)
+    reject_shared_names((row.policy, row.identity, files.folder) for row, files in results)
+    reject_different(results, across)
     outcomes: list[tuple[str, Mapping[str, object], Path]] = []
     for row, files in results:
         episode_name = f"{row} by {row.policy}, episode {row.episode}"
@@ -378,7 +378,7 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
         PipelineError: if a task has two episodes.
     """
     acted = [(row, files) for row, files in group if row.reason != REFUSED]
-    refuse_repeated_tasks(acted)
+    reject_repeated_tasks(acted)
     settings = group[0][0].settings
     name_parts = [alike[0].policy]
     for key, value in settings.items():

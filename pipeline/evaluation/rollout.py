@@ -28,7 +28,7 @@ from pipeline.evaluation.results import (
     EpisodeFiles,
     EpisodeResult,
     one_setting,
-    refuse_shared_names,
+    reject_shared_names,
 )
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum_of, edition
@@ -164,16 +164,16 @@ class Evaluation:
             PipelineError: if the folder has files of another kind, or results of another policy with this name, or
                 results of other versions that nobody allowed to generate again. No file is changed.
         """
-        self.files.refuse_other_folder()
+        self.files.reject_other_folder()
         policies = [(row.policy, row.identity, self.folder) for row in self.files.rows()]
-        refuse_shared_names([*policies, (self.policy.name(self.identity), self.identity, self.folder)])
+        reject_shared_names([*policies, (self.policy.name(self.identity), self.identity, self.folder)])
         outdated: Counter[str] = Counter()
         for task in tasks:
             row = self.files.row(self.episode(task))
             reason = None if row is None else _record(row).why_not(self.basis(task), PER_TASK)
             if reason is not None:
                 outdated[f"episodes, generated with {reason}"] += 1
-        identity.refuse_unasked(outdated, self.folder, REMAKE)
+        identity.reject_unasked(outdated, self.folder, REMAKE)
 
     def basis(self, task: EvaluationTask) -> Basis:
         """Return everything that the result of an episode depends on."""

@@ -344,15 +344,15 @@ def construct(
     Raises:
         PipelineError: if a result has another seed, because its perturbations differ under equal names.
     """
-    refused = set()
+    rejected = set()
     for row in results:
         if row.seed != seed:
             raise PipelineError(
                 f"the result has seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
             )
         if row.reason == REFUSED:
-            refused.add(str(row))
-    accepted = [task for task in drawn if str(task) not in refused]
+            rejected.add(str(row))
+    accepted = [task for task in drawn if str(task) not in rejected]
     apart = accepted
     if plan is not None:
         apart = [task for task in accepted if not plan.overlap(draw(task, seed), find_task(task.suite, task.base))]

@@ -178,8 +178,8 @@ class Simulator(Environment):
             absolute: true if the action is a goal.
 
         Raises:
-            RefusedError: ``simulation_unstable`` if numbers grow too large to compute with, and if MuJoCo has reset the
-                scene because of such numbers.
+            RejectedError: ``simulation_unstable`` if numbers grow too large to compute with, and if MuJoCo has reset
+                the scene because of such numbers.
         """
         data = self._env.sim.data._data
         qpos = data.qpos.copy()

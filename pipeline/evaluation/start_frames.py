@@ -70,7 +70,7 @@ class StartFrames:
             srgb: True for the textures of MuJoCo 3.3.3 and later.
 
         Raises:
-            RefusedError: if the scene does not settle.
+            RejectedError: if the scene does not settle.
         """
         renderer = self._restore(start)
         with srgb_textures(renderer) if srgb else nullcontext():

@@ -38,9 +38,9 @@ from pipeline.evaluation.results import (
     Stored,
     Trial,
     one_setting,
-    refuse_different,
-    refuse_repeated_models,
-    refuse_repeated_tasks,
+    reject_different,
+    reject_repeated_models,
+    reject_repeated_tasks,
 )
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.grouping import grouped
@@ -276,9 +276,9 @@ def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
     """
     for model_results in results:
         one_setting(model_results)
-        refuse_repeated_tasks(model_results)
-    refuse_repeated_models(results)
-    refuse_different(chain(*results))
+        reject_repeated_tasks(model_results)
+    reject_repeated_models(results)
+    reject_different(chain(*results))
     models: list[dict[Trial, bool]] = []
     for model_results in results:
         models.append({row.trial: row.success for row, _ in model_results if row.reason != REFUSED})

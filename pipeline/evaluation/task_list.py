@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pipeline.errors import PipelineError
 from pipeline.evaluation.own_draws import first_draws
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import refuse_other_file, write
+from pipeline.files import reject_other_file, write
 from pipeline.seeding import digest
 
 
@@ -61,13 +61,13 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
     return listed.tasks
 
 
-def refuse_other_list(file: Path) -> None:
+def reject_other_list(file: Path) -> None:
     """Reject a file that ``write_tasks`` would overwrite but has not written.
 
     Raises:
         PipelineError: if the file is rejected; it names the file.
     """
-    refuse_other_file(file, '"draws": "')
+    reject_other_file(file, '"draws": "')
 
 
 def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:

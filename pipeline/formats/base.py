@@ -55,14 +55,14 @@ class FormatOptions(Frozen):
     if TYPE_CHECKING:
         validation: Share = 0.0
 
-    def refuse_name(self) -> None:
+    def reject_name(self) -> None:
         """Reject a name under which a client would misread the dataset.
 
         Raises:
             ValueError: naming the client.
         """
 
-    def refuse_content(self, content: Content) -> None:
+    def reject_content(self, content: Content) -> None:
         """Reject options that do not fit the content of the run's episodes.
 
         Raises:

@@ -34,7 +34,7 @@ class RldsConfig(FormatOptions):
     shards: Count | None = None
     validation: Share = 0.0
 
-    def refuse_name(self) -> None:
+    def reject_name(self) -> None:
         # OpenVLA-OFT decides by the name whether it reads a set with LIBERO's constants and cameras.
         if "libero" not in self.name or "aloha" in self.name:
             raise ValueError(

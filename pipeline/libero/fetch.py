@@ -48,7 +48,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         # Without a connection, the download below accepts any folder that is not empty.
         listed = HfApi(endpoint, token=False).dataset_info(REPOSITORY, revision=REVISION, files_metadata=True)
         stated = {file.rfilename: file for file in listed.siblings or ()}
-        _refuse_other_files(out, wanted, stated)
+        _reject_other_files(out, wanted, stated)
         present = [name for name in wanted if (out / name).exists()]
         snapshot_download(
             REPOSITORY,
@@ -79,7 +79,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
     return [out / name for name in wanted]
 
 
-def _refuse_other_files(out: Path, wanted: Iterable[str], stated: dict[str, RepoSibling]) -> None:
+def _reject_other_files(out: Path, wanted: Iterable[str], stated: dict[str, RepoSibling]) -> None:
     """Reject entries of ``out`` that a download would replace and that are not the hub's files.
 
     Args:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import PipelineError, RejectedError
 from pipeline.libero.arenas import SURFACES
 from pipeline.libero.assets import as_evaluated
 from pipeline.libero.carried import definition_of
@@ -173,7 +173,7 @@ class Environment:
         """Keep the arm still, with the gripper open, for some control steps, while arm and objects come to rest.
 
         Raises:
-            RefusedError: see ``step``.
+            RejectedError: see ``step``.
         """
         # A push counts its steps from the first observation, which follows the settling.
         self._steps = -steps
@@ -242,7 +242,7 @@ class Environment:
         """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1].
 
         Raises:
-            RefusedError: ``simulation_unstable`` if the numbers grow beyond the range that can be computed.
+            RejectedError: ``simulation_unstable`` if the numbers grow beyond the range that can be computed.
         """
         self._act_from_outside()
         with self._stable():
@@ -250,18 +250,18 @@ class Environment:
 
     @contextmanager
     def _stable(self) -> Iterator[None]:
-        """Turn numerical errors of the simulation into a ``RefusedError``.
+        """Turn numerical errors of the simulation into a ``RejectedError``.
 
         Raises:
-            RefusedError: ``simulation_unstable`` if numbers grow beyond the range that can be computed.
+            RejectedError: ``simulation_unstable`` if numbers grow beyond the range that can be computed.
         """
         try:
             yield
         except (np.linalg.LinAlgError, mujoco.FatalError) as error:
-            raise RefusedError("simulation_unstable") from error
+            raise RejectedError("simulation_unstable") from error
         # After too large accelerations, MuJoCo resumes from the model's own pose and raises nothing.
         if self.sim.data._data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
-            raise RefusedError("simulation_unstable")
+            raise RejectedError("simulation_unstable")
 
     def _act_from_outside(self) -> None:
         """Begin or end the scene's push, and count the step that follows."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero.starts import LEFT_OUT_STEPS, kept_actions, recorded_start
 from pipeline.machine_code import fixed_machine_code
 from pipeline.physics.environment import Environment, UnusableSceneError, shared
@@ -49,7 +49,7 @@ def replay(
     """
     fixed_machine_code()
     try:
-        scene, refused = _apply_perturbations(environment, demo, replay_config, perturbations)
+        scene, rejected = _apply_perturbations(environment, demo, replay_config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
         scene = Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)})
@@ -57,11 +57,11 @@ def replay(
         dropped = Verdict(False, error.reason)
         return Trajectory(trajectory_id, "open_loop", scene, demo.init_state[None], none, alpha, dropped)
 
-    if refused:
+    if rejected:
         mode = "tracked" if replay_config.mode == "tracked" and reference() is not None else "open_loop"
         # The first state alone is stored.
         states, actions, alphas, _ = _execute(environment, scene, 0, lambda: iter(()))
-        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused)
+        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, rejected)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         states, actions, alphas, judged = _execute(environment, scene, replay_config.settle_steps, policy)
@@ -95,7 +95,7 @@ def _execute(
     # If the scene does not settle, store only the initial state.
     states, alphas = [environment.state], [environment.site_alpha]
     actions, succeeded = [], []
-    refused = None
+    rejected = None
     try:
         environment.settle(settle_steps)
         states, alphas = [environment.state], [environment.site_alpha]
@@ -105,9 +105,9 @@ def _execute(
             states.append(environment.state)
             alphas.append(environment.site_alpha)
             succeeded.append(environment.succeeded())
-    except RefusedError as error:
-        refused = Verdict(False, error.reason)
-    judged = refused or verdict(np.stack(states), np.array(succeeded, bool))
+    except RejectedError as error:
+        rejected = Verdict(False, error.reason)
+    judged = rejected or verdict(np.stack(states), np.array(succeeded, bool))
     return np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged
 
 
@@ -141,7 +141,7 @@ def _apply_perturbations(
     try:
         for perturbation in perturbations:
             scene = perturbation.apply(scene, demo, partial(roll_out, replay_config=replay_config))
-    except RefusedError as error:
+    except RejectedError as error:
         return scene, Verdict(False, error.reason)
     return scene, None
 
@@ -171,7 +171,7 @@ def roll_out(scene: Scene, demo: Demo, replay_config: ReplayConfig = ReplayConfi
         replay_config: settling and no-op rule of the later replay.
 
     Raises:
-        RefusedError: ``simulation_unstable``.
+        RejectedError: ``simulation_unstable``.
     """
     actions = demo.actions[kept_actions(demo.actions, replay_config.noops)]
     return _states_from(scene, demo.task, actions, replay_config)
@@ -188,7 +188,7 @@ def first_look(scene: Scene, task: Task, replay_config: ReplayConfig) -> Floats:
     """Return the state (S,) in which ``scene`` has settled, which the first frame of a replay shows.
 
     Raises:
-        RefusedError: ``simulation_unstable``.
+        RejectedError: ``simulation_unstable``.
     """
     return np.asarray(_states_from(scene, task, np.empty(0), replay_config)[0])
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.physics.reference import Reference, runs
 from pipeline.types import Floats
 
@@ -96,7 +96,7 @@ class Route:
             poses: object, fixture or region to its pose (7,) in the scene; things that are left out have not moved.
 
         Raises:
-            RefusedError: ``object_not_upright`` if a thing that the hand meets has fallen over. No bend about the
+            RejectedError: ``object_not_upright`` if a thing that the hand meets has fallen over. No bend about the
                 vertical follows such a displacement.
         """
 
@@ -114,7 +114,7 @@ class Route:
                 continue
             share = _followed(reference, name) * free_share
             if np.abs(turn[:2]).max() > TILTED_RAD and share.any():
-                raise RefusedError("object_not_upright")
+                raise RejectedError("object_not_upright")
             upright = np.array([0.0, 0.0, turn[2]])
             free_share, weights = free_share - share, share[:, None]
             turned = Rotation.from_rotvec(upright).apply(positions - reference_pose[:3])

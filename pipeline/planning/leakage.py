@@ -243,7 +243,7 @@ def report(findings: dict[str, AxisDistance]) -> Group:
     return Group(table, covered, *map(Text, lines))
 
 
-def refuse_overlap(findings: dict[str, AxisDistance]) -> None:
+def reject_overlap(findings: dict[str, AxisDistance]) -> None:
     """Stop a run that would train on test tasks.
 
     Raises:

@@ -117,7 +117,7 @@ def _rows_of_entry(
     alike = grouped(((task.suite, is_in_tested_scene(task)), task) for task in demos_of)
     for axis in sampler.axes:
         for tasks in alike.values():
-            axis.refuse_tested(test, tasks[0])
+            axis.reject_tested(test, tasks[0])
     # Each axis has its own order. Else small numbers of episodes would use the same tasks on all axes.
     ordered = sorted(demos_of, key=lambda task: digest(plan.seed, name, task.suite, task.name))
     weights = [plan.task_weights.get(str(task), 1.0) for task in ordered]
@@ -182,7 +182,7 @@ def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, r
     return rows
 
 
-def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
+def reject_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
     """Reject replay settings that differ from the settings in the ids.
 
     Raises:

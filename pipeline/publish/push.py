@@ -90,7 +90,7 @@ def prepare(target: Format[Any], run: Run) -> Upload:
     """
     recorded = target.record().files
     dataset = {target.repository_path(path): file for path, file in _exactly(target.folder, {*recorded}).items()}
-    _refuse_unvalidated(run, dataset, target.name)
+    _reject_unvalidated(run, dataset, target.name)
     for file in target.written():
         for fault in file.faults():
             raise PipelineError(fault.what, expected=fault.expected)
@@ -102,7 +102,7 @@ def prepare(target: Format[Any], run: Run) -> Upload:
             name = inside + path.removeprefix(f"{below}/")
             others[name], sha256[name] = source, checksums[path]
     if CHECKSUMS in others:
-        _refuse_other_dataset(others[CHECKSUMS], sha256, dataset)
+        _reject_other_dataset(others[CHECKSUMS], sha256, dataset)
     for name, recorded_sha256 in read_record(run.path(CARD)).basis.requested.items():
         source = run.path(name)
         if source.is_symlink() or checksum(source) != recorded_sha256:
@@ -194,7 +194,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             commit_message=f"Upload run {upload.run} as {upload.format}: {len(contents)} files",
             parent_commit=there.commit,
         )
-        _refuse_other_content(files_of(api, repository, str(commit.oid)), sent, repository)
+        _reject_other_content(files_of(api, repository, str(commit.oid)), sent, repository)
         if upload.tag is not None:  # An earlier upload may have the tag, which then moves.
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
@@ -243,7 +243,7 @@ def _contents(upload: Upload, repository: str) -> tuple[dict[str, Path | bytes],
     return contents, LastUpload(run=upload.run, format=upload.format, files=dict(sorted(checksums.items())))
 
 
-def _refuse_other_content(files: Mapping[str, RepoFile], sent: LastUpload, repository: str) -> None:
+def _reject_other_content(files: Mapping[str, RepoFile], sent: LastUpload, repository: str) -> None:
     """Raise an error if the hub has other content than recorded, such as a file that changed while it was sent."""
     wrong = [path for path, content in sent.files.items() if path not in files or not content.is_of(files[path])]
     if wrong:
@@ -278,7 +278,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
     return files
 
 
-def _refuse_other_dataset(checksums: Path, sha256: Mapping[str, str], dataset: Iterable[str]) -> None:
+def _reject_other_dataset(checksums: Path, sha256: Mapping[str, str], dataset: Iterable[str]) -> None:
     """Raise an error if the card was generated for other files of the dataset, such as those of other options."""
     described: dict[str, str] = {}
     for line in checksums.read_text().splitlines():
@@ -293,7 +293,7 @@ def _refuse_other_dataset(checksums: Path, sha256: Mapping[str, str], dataset: I
         )
 
 
-def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
+def _reject_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
     """Raise an error unless exactly these files passed validation, and the card exists.
 
     The content of the report that the card was generated from is compared in ``prepare``.

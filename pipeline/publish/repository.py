@@ -147,7 +147,7 @@ def deletions(there: Repository, new: LastUpload, folders: Set[str], *, replace:
     if old is None or (old.run, old.format) != (new.run, new.format):
         origin = "files of unknown origin" if old is None else f"the upload of run {old.run}, format {old.format}"
         if there.files and not replace:
-            _refuse(there, f"the repository has {origin}", list(there.files), new)
+            _reject(there, f"the repository has {origin}", list(there.files), new)
         return sorted(there.files.keys() - mine)
 
     foreign: list[str] = []
@@ -158,11 +158,11 @@ def deletions(there: Repository, new: LastUpload, folders: Set[str], *, replace:
         if in_the_way and not same and not uploaded and path != UPLOAD:
             foreign.append(path)
     if foreign and not replace:
-        _refuse(there, "the repository was edited on the hub since the last upload", foreign, new)
+        _reject(there, "the repository was edited on the hub since the last upload", foreign, new)
     return sorted((there.files.keys() & old.files.keys() | {*foreign}) - mine)
 
 
-def _refuse(there: Repository, what: str, paths: list[str], new: LastUpload) -> None:
+def _reject(there: Repository, what: str, paths: list[str], new: LastUpload) -> None:
     paths = sorted(paths)
     further = f" and {len(paths) - MAX_NAMED} more" if len(paths) > MAX_NAMED else ""
     raise PipelineError(

@@ -50,8 +50,8 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
     if path.suffix != ".html":
         raise PipelineError("the report is an HTML page", where=path, expected="a name that ends in .html")
     json_path = path.with_suffix(".json")
-    files.refuse_other_file(path, "<title>Evaluation: ")
-    files.refuse_other_file(json_path, '"paper_table": ')
+    files.reject_other_file(path, "<title>Evaluation: ")
+    files.reject_other_file(json_path, '"paper_table": ')
     found = findings(policies)
     videos = dict(chain.from_iterable(policy.videos.items() for policy in policies))
     files.write(path, page(found, videos))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import PipelineError
-from pipeline.files import refuse_other_file, write
+from pipeline.files import reject_other_file, write
 from pipeline.report.paper_table import DIMENSIONS
 
 COLUMNS = (*DIMENSIONS, "total", "mean of seven")
@@ -314,7 +314,7 @@ def write_table(table: Mapping[str, Any], path: Path) -> list[Path]:
     Raises:
         PipelineError: if a file would overwrite a file of another origin.
     """
-    refuse_other_tables(path)
+    reject_other_tables(path)
     texts = {".md": markdown(table), ".csv": csv_text(table), ".tex": latex(table)}
     written = []
     for suffix, text in texts.items():
@@ -324,7 +324,7 @@ def write_table(table: Mapping[str, Any], path: Path) -> list[Path]:
     return written
 
 
-def refuse_other_tables(path: Path) -> None:
+def reject_other_tables(path: Path) -> None:
     """Reject files that ``write_table`` would overwrite but has not written.
 
     Args:
@@ -336,4 +336,4 @@ def refuse_other_tables(path: Path) -> None:
     if path.name in ("", ".."):
         raise PipelineError("the path has no name for the files", where=path, expected="a name such as tables/mine")
     for suffix, mark in MARKS.items():
-        refuse_other_file(path.with_name(path.name + suffix), mark)
+        reject_other_file(path.with_name(path.name + suffix), mark)

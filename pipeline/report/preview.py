@@ -16,7 +16,7 @@ from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPer
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import PipelineError, RejectedError
 from pipeline.files import replaced
 from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import Problem
@@ -67,7 +67,7 @@ class Stage:
         """Render the views, (H, W, 3) each, as a policy sees them under all of the perturbations.
 
         Raises:
-            RefusedError: when a perturbation is impossible in this scene.
+            RejectedError: when a perturbation is impossible in this scene.
         """
         demo, scene = self._start(perturbations)
         for physics in of_layer(perturbations, PhysicsPerturbation):
@@ -101,17 +101,17 @@ class Stage:
         """Render the agent view at some steps of a pushed replay, without and with the push.
 
         Raises:
-            RefusedError: when the push is impossible in the demonstration, or its replay without one misses the goal.
+            RejectedError: when the push is impossible in the demonstration, or its replay without one misses the goal.
         """
         twin = self._twin
         if not twin.verdict.kept:
-            raise RefusedError(twin.verdict.reason)
+            raise RejectedError(twin.verdict.reason)
         reference = Reference.of(twin.model_xml, twin.states, twin.actions)
         changes = of_layer((perturbation,), PhysicsPerturbation)
         pushed = replay(shared(self.demo.task), self.demo, "pushed", self.replay, changes, lambda: reference)
         push = pushed.scene.push
         if push is None:
-            raise RefusedError(pushed.verdict.reason)
+            raise RejectedError(pushed.verdict.reason)
         renderer, stream = self.opened.renderer(pushed.model_xml), Stream("image", ())
         end = push.first_step + push.steps
         steps_and_frames = []
@@ -194,7 +194,7 @@ def combinations(
         if not axis.applies(demo.task):
             what = f"the axis {axis_name} cannot change the task {demo.task}"
             raise PipelineError(what, remedy="choose another task or another axis")
-        axis.refuse_tested(test, demo.task)
+        axis.reject_tested(test, demo.task)
     draws = Sampler(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
     left = list(islice(draws, CANDIDATES))
     chosen: list[tuple[Perturbation, ...]] = []
@@ -250,8 +250,8 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
             visible = any(p.views for p in perturbations)
             frames = stage.frames(views, *perturbations) if visible else original
             tiles.append(Tile(side_by_side(frames, side), caption))
-        except RefusedError as refused:
-            tiles.append(_refused(refused, caption, tiles[0].picture.size))
+        except RejectedError as rejected:
+            tiles.append(_rejected_tile(rejected, caption, tiles[0].picture.size))
     moment = "replays" if strips else "first state"
     kind = "axes" if "+" in name else "axis"
     return sheet(f"{demo.demo_id}, {moment}; {kind} {name}, seed {seed}; {', '.join(views)}", tiles)
@@ -265,8 +265,8 @@ def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
     caption = f"without and with {describe(push)}"
     try:
         steps_and_frames = stage.strip(push)
-    except RefusedError as refused:
-        return [_refused(refused, caption)]
+    except RejectedError as rejected:
+        return [_rejected_tile(rejected, caption)]
     return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in steps_and_frames]
 
 
@@ -295,13 +295,13 @@ def _typical(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
         caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
         try:
             (frame,) = stage.frames(["image"], perturbation)
-        except RefusedError as refused:
-            last = refused, caption
+        except RejectedError as rejected:
+            last = rejected, caption
         else:
             for text in of_layer((perturbation,), TextPerturbation):
                 return Tile(lettering(text.apply(stage.demo.task.instruction), SIDE_PX[1]), caption)
             return Tile(Image.fromarray(frame), caption)
-    return _refused(*last)
+    return _rejected_tile(*last)
 
 
 def _nothing_drawn(name: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
@@ -309,7 +309,7 @@ def _nothing_drawn(name: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1]
     return Tile(Image.new("RGB", size_px, REFUSED_GREY), caption)
 
 
-def _refused(why: RefusedError, caption: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
+def _rejected_tile(why: RejectedError, caption: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
     return Tile(Image.new("RGB", size_px, REFUSED_GREY), f"rejected, {why.reason}: {caption}")
 
 

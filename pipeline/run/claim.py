@@ -58,13 +58,13 @@ def claim_folder(file: Path) -> Config:
             mark.
     """
     config = load(file)
-    _refuse_other_owner(config, file)
+    _reject_other_owner(config, file)
     config.data.mkdir(parents=True, exist_ok=True)
-    _refuse_links(config.data)
+    _reject_links(config.data)
     wanted = Mark(file.resolve(), _content(file))
     if _mark(config.data) != wanted:
         with locked(config.data):
-            _refuse_other_owner(config, file)  # Another stage may have claimed the folder in the meantime.
+            _reject_other_owner(config, file)  # Another stage may have claimed the folder in the meantime.
             path = os.path.relpath(wanted.file, config.data.resolve())
             content = {"configuration": path, "name": config.name, "content": wanted.content}
             write_json(config.data / OWNER, content)
@@ -108,13 +108,13 @@ def open_run(file: Path) -> Run:
         PipelineError: when the configuration is not valid, or the folder belongs to another file.
     """
     config = load(file)
-    _refuse_missing_disk(config, file)
+    _reject_missing_disk(config, file)
     if (config.data / OWNER).exists():
-        _refuse_other_owner(config, file)
+        _reject_other_owner(config, file)
     return Run(config)
 
 
-def refuse_unmarked(folder: Path) -> None:
+def reject_unmarked(folder: Path) -> None:
     """Reject a folder with files that no configuration has claimed, as the files do not belong to a run.
 
     Raises:
@@ -143,7 +143,7 @@ def refuse_unmarked(folder: Path) -> None:
         )
 
 
-def refuse_other_folder(file: Path) -> None:
+def reject_other_folder(file: Path) -> None:
     """Reject a configuration whose run is not where DVC looks for the files of stages, by params.yaml.
 
     Raises:
@@ -170,7 +170,7 @@ def refuse_other_folder(file: Path) -> None:
         )
 
 
-def _refuse_missing_disk(config: Config, file: Path) -> None:
+def _reject_missing_disk(config: Config, file: Path) -> None:
     """Reject a mistyped absolute path, below which a run would fill the disk of the system."""
     if config.folder.is_absolute() and not config.folder.parent.exists():
         raise PipelineError(
@@ -181,12 +181,12 @@ def _refuse_missing_disk(config: Config, file: Path) -> None:
         )
 
 
-def _refuse_other_owner(config: Config, file: Path) -> None:
+def _reject_other_owner(config: Config, file: Path) -> None:
     """Reject a folder that must not be given to a configuration file."""
     folder = config.data
-    _refuse_missing_disk(config, file)
-    refuse_unmarked(folder)
-    _refuse_folder_in_run(folder)
+    _reject_missing_disk(config, file)
+    reject_unmarked(folder)
+    _reject_folder_in_run(folder)
     mark = _mark(folder)
     if mark is None or mark.file == file.resolve():
         return
@@ -208,7 +208,7 @@ def _refuse_other_owner(config: Config, file: Path) -> None:
         )
 
 
-def _refuse_folder_in_run(folder: Path) -> None:
+def _reject_folder_in_run(folder: Path) -> None:
     for parent in folder.resolve().parents:
         if (parent / OWNER).is_file() and (parent / LOCK).is_file():
             raise PipelineError(
@@ -250,7 +250,7 @@ def _content(file: Path) -> str:
     return digest({name: value for name, value in fields.items() if name not in PLACES})
 
 
-def _refuse_links(folder: Path) -> None:
+def _reject_links(folder: Path) -> None:
     links = [entry for entry in folder.iterdir() if entry.is_symlink()]
     if links:
         raise PipelineError(

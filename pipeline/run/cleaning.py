@@ -7,10 +7,10 @@ from typing import NamedTuple
 from pipeline.export_config import FAILURES
 from pipeline.files import remove
 from pipeline.formats.registry import GROUPS, formats_in
-from pipeline.generated import refuse_edits
-from pipeline.run.claim import locked, refuse_unmarked
-from pipeline.run.export import refuse_unrecorded
-from pipeline.run.foreign import refuse_foreign_files
+from pipeline.generated import reject_edits
+from pipeline.run.claim import locked, reject_unmarked
+from pipeline.run.export import reject_unrecorded
+from pipeline.run.foreign import reject_foreign_files
 from pipeline.run.layout import (
     CARD,
     COUNTS,
@@ -91,7 +91,7 @@ def found(run: Run, parts: Iterable[str]) -> dict[str, float]:
     return sizes_mb
 
 
-def refuse_foreign(run: Run, parts: Iterable[str]) -> None:
+def reject_foreign(run: Run, parts: Iterable[str]) -> None:
     """Stop before parts are deleted that hold files of the user.
 
     Raises:
@@ -99,11 +99,11 @@ def refuse_foreign(run: Run, parts: Iterable[str]) -> None:
     """
     for part in parts:
         if part == "uploads":
-            refuse_edits(run.folder)
-        refuse_foreign_files(run.folder, PARTS[part].names)
+            reject_edits(run.folder)
+        reject_foreign_files(run.folder, PARTS[part].names)
         if part in GROUPS:
             for folder in filter(Path.is_dir, map(run.path, PARTS[part].names)):
-                refuse_unrecorded(folder)
+                reject_unrecorded(folder)
 
 
 def delete(run: Run, parts: Iterable[str]) -> None:
@@ -113,10 +113,10 @@ def delete(run: Run, parts: Iterable[str]) -> None:
         PipelineError: when the folder has no mark of a run, a stage of the run is running, or a part holds files that
             no stage generated, or edited files.
     """
-    refuse_unmarked(run.folder)
+    reject_unmarked(run.folder)
     with locked(run.folder):
         chosen = [*parts]
-        refuse_foreign(run, chosen)
+        reject_foreign(run, chosen)
         for part in chosen:
             for name in PARTS[part].names:
                 remove(run.path(name))

@@ -1,6 +1,6 @@
 """Finished work that a changed configuration no longer needs: measured, and reported before a stage deletes it.
 
-The stages ``plan``, ``replay`` and ``render`` call ``refuse_deletion`` before they replace or delete anything.
+The stages ``plan``, ``replay`` and ``render`` call ``reject_deletion`` before they replace or delete anything.
 ``status`` and ``doctor`` report the result of ``measure``.
 """
 
@@ -104,7 +104,7 @@ def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
     )
 
 
-def refuse_deletion(rows: Sequence[plan.Row], run: Run) -> None:
+def reject_deletion(rows: Sequence[plan.Row], run: Run) -> None:
     """Print the amount of finished work that a plan drops, and stop if it is large and the deletion is not allowed.
 
     Raises:

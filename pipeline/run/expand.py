@@ -28,7 +28,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import remove
 from pipeline.grouping import grouped
-from pipeline.identity import DISTRIBUTION, REMAKE, refuse_unasked
+from pipeline.identity import DISTRIBUTION, REMAKE, reject_unasked
 from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
@@ -90,9 +90,9 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     """
     file_of = {entry.task: out / entry.task.suite / f"{entry.task.name}_demo.hdf5" for entry in demos.index().entries}
     for file in file_of.values():
-        _refuse_other_demonstrations(file)
+        _reject_other_demonstrations(file)
     store = TrajectoryStore(out / ".replays")
-    refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
+    reject_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     faults: dict[str, str] = {}
     while True:
         verdicts = Replays(demos, REPLAY, store, workers).complete(rows, faults)
@@ -107,7 +107,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     result = Expansion(dropped=Counter(reason for reason in reasons if reason not in not_dropped))
     by_task = grouped((f"{row.suite}/{row.task}", row) for row in kept)
     for task, file in file_of.items():
-        _refuse_loss(file, by_task.get(str(task), []))
+        _reject_loss(file, by_task.get(str(task), []))
     for task, file in file_of.items():
         rows_of_task = by_task.get(str(task), [])
         if len(rows_of_task) < per_task:
@@ -121,7 +121,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     return result
 
 
-def _refuse_other_demonstrations(file: Path) -> None:
+def _reject_other_demonstrations(file: Path) -> None:
     if not file.exists():
         return
     expanded = hdf5.expansions(file)
@@ -134,7 +134,7 @@ def _refuse_other_demonstrations(file: Path) -> None:
         )
 
 
-def _refuse_loss(file: Path, rows: Sequence[plan.Row]) -> None:
+def _reject_loss(file: Path, rows: Sequence[plan.Row]) -> None:
     """Stop before demonstrations of an earlier expansion are deleted, unless ``REMAKE=1`` allows it.
 
     Args:

@@ -34,7 +34,7 @@ from pipeline.files import (
 )
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
-from pipeline.identity import ALLOW, REMAKE, refuse_unasked
+from pipeline.identity import ALLOW, REMAKE, reject_unasked
 from pipeline.record import Basis
 from pipeline.run.layout import DATASETS, WORK
 from pipeline.run.outcome import shuffled
@@ -75,8 +75,8 @@ def export_run(kind: type[AnyFormat], run: Run) -> None:
 
 
 def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
-    refuse_foreign(target, episodes)
-    refuse_changed(target)
+    reject_foreign(target, episodes)
+    reject_changed(target)
     if not episodes.ids and "outcome" in target.content.extras:
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
@@ -86,13 +86,13 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
         remove_leftovers(target)
         print(f"{target.folder} is up to date, with {len(episodes.ids)} episodes: see {target.record_file}")
         return
-    refuse_unasked(outdated(target, episodes), target.folder)
+    reject_unasked(outdated(target, episodes), target.folder)
     with run.workers() as workers:
         export(target, episodes, workers)
     print(f"wrote {len(episodes.ids)} episodes to {target.folder}")
 
 
-def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
+def reject_foreign(target: AnyFormat, episodes: Episodes) -> None:
     """Stop if the format's folder has entries that no export wrote, as a dataset is replaced as a whole.
 
     Raises:
@@ -132,7 +132,7 @@ def _foreign_entries_error(target: AnyFormat, foreign: Sequence[Path], sets: Col
     )
 
 
-def refuse_changed(target: AnyFormat) -> None:
+def reject_changed(target: AnyFormat) -> None:
     """Stop before a changed file of a finished dataset is replaced; a missing file is generated again.
 
     Raises:
@@ -156,7 +156,7 @@ def refuse_changed(target: AnyFormat) -> None:
         )
 
 
-def refuse_unrecorded(folder: Path) -> None:
+def reject_unrecorded(folder: Path) -> None:
     """Stop before the folder of a format's datasets is deleted if it has files that no record of an export lists.
 
     The format need not be requested.

@@ -31,7 +31,7 @@ FILE_IN_USE = re.compile(r"\.nfs[0-9a-f]+")
 """Name that NFS gives to a deleted file until the last process closes it."""
 
 
-def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> None:
+def reject_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> None:
     """Stop before a stage, or ``clean``, would delete files that no stage generated.
 
     Args:

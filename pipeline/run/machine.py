@@ -116,14 +116,14 @@ def record(run: Run, trial: Mapping[str, str]) -> None:
     """Record this machine's trial, unless the run was begun on a machine with another result.
 
     Raises:
-        PipelineError: as ``refuse_another``.
+        PipelineError: as ``reject_another``.
     """
-    refuse_another(run, trial)
+    reject_another(run, trial)
     here = {**made_with("encoding"), "OpenGL device": trial["OpenGL device"]}
     write_json(run.path(MACHINE), {"made with": here, "trials": trials(run) | _named(trial)})
 
 
-def refuse_another(run: Run, trial: Mapping[str, str]) -> None:
+def reject_another(run: Run, trial: Mapping[str, str]) -> None:
     """Compare a trial with the recorded ones; nothing is written.
 
     Raises:

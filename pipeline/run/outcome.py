@@ -90,7 +90,7 @@ def replayed(
     trajectories = store.rows()
     needed = selection.pending(rows, verdicts_of(trajectories, rows, limits), rejected)
     # Only the stage `render` replays reserves that replace episodes with rejected frames.
-    _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
+    _reject_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
 
 
@@ -134,7 +134,7 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
     kept = [row for row in rows if judged[row.episode_id].kept]
     not_rendered = [row for row in (*kept, *failures) if not rendered(row, stored_frames, views)]
     folders = dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)
-    _refuse_missing(list(folders), "render")
+    _reject_missing(list(folders), "render")
     return Outcome(rows, replays, stored_frames, judged, [row.episode_id for row in failures])
 
 
@@ -155,7 +155,7 @@ def rendered(row: plan.Row, frames: Mapping[str, StoredFrames], views: tuple[str
     return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams
 
 
-def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
+def _reject_missing(missing: Sequence[Path], stage: str) -> None:
     if missing:
         raise PipelineError(
             f"{len(missing)} files or folders that the plan needs are missing, damaged or outdated, such as this one",
@@ -170,8 +170,8 @@ def outdated(
     """Count the stored files of a plan that this version, or this machine, would generate again, by reason.
 
     The count includes finished files of today's plan, with today's settings, that were generated with other recipes,
-    packages, machine code or another OpenGL device: see ``identity.refuse_unasked``. Files that a changed
-    configuration or plan replaces are not counted: ``dropped.refuse_deletion`` reports them.
+    packages, machine code or another OpenGL device: see ``identity.reject_unasked``. Files that a changed
+    configuration or plan replaces are not counted: ``dropped.reject_deletion`` reports them.
 
     Args:
         device: OpenGL name of the device that renders here; without it, frames of any device count as finished.

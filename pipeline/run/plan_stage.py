@@ -26,9 +26,9 @@ def make(config: Config) -> list[plan.Row]:
         print(f"left out: {problem.error}", file=sys.stderr)
     for note in index.notes:
         print(note, file=sys.stderr)
-    config.demos.refuse_tasks_without(index.entries)
+    config.demos.reject_tasks_without(index.entries)
     rows = plan.make(index.entries, config.plan, config.replay, benchmark.load())
-    config.export.refuse_too_few(plan.demonstrations(rows))
+    config.export.reject_too_few(plan.demonstrations(rows))
     return rows
 
 

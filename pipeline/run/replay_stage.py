@@ -57,7 +57,7 @@ class Replays:
                     self._replay(missing, rows)
                     stored = verdicts_of(self.store.refresh(), rows, self.limits)
                     undone = [trajectory_id for trajectory_id in missing if trajectory_id not in stored]
-                    _refuse_undone([self.store.path(trajectory_id) for trajectory_id in undone])
+                    _reject_undone([self.store.path(trajectory_id) for trajectory_id in undone])
                 verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed}
         return verdicts
 
@@ -74,7 +74,7 @@ class Replays:
         self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
 
 
-def _refuse_undone(files: Sequence[Path]) -> None:
+def _reject_undone(files: Sequence[Path]) -> None:
     if files:
         raise PipelineError(
             f"{len(files)} trajectories were replayed and are still missing, such as this one",

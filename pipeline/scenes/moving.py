@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import rotations
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero.carried import definition_of
 from pipeline.libero.task_goal import relation_holds
 from pipeline.scenes.compiled import CompiledScene, simulate_held
@@ -37,7 +37,7 @@ def move_one(scene: Scene, task: Task, name: str, shift_m: tuple[float, float], 
     to rest on the same things, and the moved object must not move more than the recorded object.
 
     Raises:
-        RefusedError: for the reasons of ``move``.
+        RejectedError: for the reasons of ``move``.
     """
     before = CompiledScene(scene)
     moved = replace(scene, state=scene.state.copy())
@@ -45,9 +45,9 @@ def move_one(scene: Scene, task: Task, name: str, shift_m: tuple[float, float], 
     pose[:2] += shift_m
     pose[3:] = rotations.product(rotations.about("z", turn_deg), pose[3:])
     after = CompiledScene(moved)
-    _refuse_relations(task, after)
+    _reject_relations(task, after)
     joints_of_object = before.model.jnt_bodyid == before.model.body(f"{name}_main").id
-    _refuse(before, after, joints_of_object, {name: shift_m})
+    _reject(before, after, joints_of_object, {name: shift_m})
     resolved = {"moved": name, "position_m": pose[:3].tolist(), "rotation_wxyz": pose[3:].tolist()}
     return replace(moved, resolved={**scene.resolved, "pose": resolved})
 
@@ -60,9 +60,9 @@ def move(scene: Scene, task: Task, moves: Moves) -> Scene:
     robot and the fixtures' joints are held.
 
     Raises:
-        RefusedError: ``relation_broken`` when a thing loses contact with the thing that it stands on or in, or a target
-            leaves the place that the instruction names; ``object_in_collision`` when things touch that did not touch
-            before; ``object_unstable`` when an object slides or tilts more than the recorded object.
+        RejectedError: ``relation_broken`` when a thing loses contact with the thing that it stands on or in, or a
+            target leaves the place that the instruction names; ``object_in_collision`` when things touch that did not
+            touch before; ``object_unstable`` when an object slides or tilts more than the recorded object.
     """
     definition = definition_of(task)
     before = CompiledScene(scene)
@@ -74,11 +74,11 @@ def move(scene: Scene, task: Task, moves: Moves) -> Scene:
         before.pose_in(state, name)[:2] += moves[name]
     moved = replace(scene, model_xml=model_xml, state=state)
     after = CompiledScene(moved)
-    _refuse_relations(task, after)
+    _reject_relations(task, after)
     positions_m = {name: after.data.body(f"{name}_main").xpos.tolist() for name in moves}
     if _blocked(after, fixtures) - _blocked(before, fixtures):
-        raise RefusedError("object_in_collision")
-    _refuse(before, after, before.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE, moves)
+        raise RejectedError("object_in_collision")
+    _reject(before, after, before.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE, moves)
     return replace(moved, resolved={**scene.resolved, "pose": {"positions_m": positions_m}})
 
 
@@ -90,16 +90,16 @@ def _shifted(model_xml: str, fixtures: Moves, regions: Moves) -> str:
     for path, shift in shifts.items():
         element = tree.find(f"worldbody//{path}")
         if element is None:
-            raise RefusedError("scene_refused")
+            raise RejectedError("scene_refused")
         x, y, z = map(float, element.get("pos", "0 0 0").split())
         element.set("pos", f"{x + shift[0]:.9g} {y + shift[1]:.9g} {z:.9g}")
     return ET.tostring(tree, encoding="unicode")
 
 
-def _refuse_relations(task: Task, scene: CompiledScene) -> None:
+def _reject_relations(task: Task, scene: CompiledScene) -> None:
     """Reject a scene with a target outside of the place that the instruction names."""
     if not all(relation_holds(task, target, scene.xy_m) for target in definition_of(task).targets):
-        raise RefusedError("relation_broken")
+        raise RejectedError("relation_broken")
 
 
 class _Settled(NamedTuple):
@@ -150,7 +150,7 @@ def _blocked(compiled: CompiledScene, fixtures: Iterable[str]) -> set[tuple[str,
     return overlapping
 
 
-def _refuse(before: CompiledScene, after: CompiledScene, free: NDArray[np.bool_], moves: Moves) -> None:
+def _reject(before: CompiledScene, after: CompiledScene, free: NDArray[np.bool_], moves: Moves) -> None:
     """Settle the recorded and the moved scene, and reject the moved scene if it differs too much.
 
     Args:
@@ -160,21 +160,21 @@ def _refuse(before: CompiledScene, after: CompiledScene, free: NDArray[np.bool_]
         moves: displacements of the moved things.
 
     Raises:
-        RefusedError: for the reasons of ``move``.
+        RejectedError: for the reasons of ``move``.
     """
     recorded, moved = _settle(before, free), _settle(after, free)
     new = (moved.started.keys() | moved.rested.keys()) - (recorded.started.keys() | recorded.rested.keys())
     deeper = any(gap_m < recorded.started.get(pair, 0.0) - DEEPER_M for pair, gap_m in moved.started.items())
     if new or deeper:
-        raise RefusedError("object_in_collision")
+        raise RejectedError("object_in_collision")
     # Neighbours that move apart may lose contact. A thing must not lose contact with the thing that it moves with or
     # stands on.
     shifts = {int(after.model.body(f"{name}_main").id): shift for name, shift in moves.items()}
     for pair in recorded.rested.keys() - moved.rested.keys():
         first_shift, second_shift = (shifts.get(int(after.model.body_rootid[body])) for body in pair)
         if first_shift == second_shift or first_shift is None or second_shift is None:
-            raise RefusedError("relation_broken")
+            raise RejectedError("relation_broken")
     slid_farther = (moved.slid_m > recorded.slid_m + CREEP_M).any()
     tilted_farther = (moved.tilted_deg > recorded.tilted_deg + CREEP_DEG).any()
     if slid_farther or tilted_farther:
-        raise RefusedError("object_unstable")
+        raise RejectedError("object_unstable")

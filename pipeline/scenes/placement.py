@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline import seeding
 from pipeline.catalogue.object_model import ObjectModel
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero.arenas import ARENAS
 from pipeline.libero.bddl import Bddl
 from pipeline.libero.carried import definition_of
@@ -57,7 +57,7 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
         roll_out: function that returns the states of the demonstration's actions in the scene without added objects.
 
     Raises:
-        RefusedError: when no place was found; its reason is the most frequent reason for the rejection of places.
+        RejectedError: when no place was found; its reason is the most frequent reason for the rejection of places.
     """
     placement = _Placement(scene, roll_out(scene, demo), objects, definition_of(demo.task))
     rejected: Counter[str] = Counter()
@@ -80,7 +80,7 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
             state=placement.state_with(scene.state, settled),
             resolved={**scene.resolved, "layout": resolved},
         )
-    raise RefusedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
+    raise RejectedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
 
 
 def added_names(resolved: Mapping[str, Any]) -> list[str]:

@@ -140,7 +140,7 @@ def _tried(run: Run, tried: bool) -> list[Diagnosis]:
 def _same(run: Run) -> Diagnosis:
     """Check that a run begun on another machine would resume here with the same results."""
     try:
-        machine.refuse_another(run, machine.trial().digests)
+        machine.reject_another(run, machine.trial().digests)
     except PipelineError as error:
         return Diagnosis("same machine", "fail", error.what, error.remedy or "")
     return Diagnosis("same machine", "ok", "ten steps and a frame equal those of the run, or the run has no output yet")

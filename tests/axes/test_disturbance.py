@@ -12,7 +12,7 @@ from pipeline.axes import Axes
 from pipeline.axes.disturbance import DisturbanceAxis, DisturbancePerturbation
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
@@ -68,7 +68,7 @@ def test_draws_are_keyed_and_as_strong_as_their_level_says() -> None:
 def refusal(change: DisturbancePerturbation) -> str | None:
     try:
         change.apply(SCENE, DEMO, roll_out)
-    except RefusedError as error:
+    except RejectedError as error:
         return error.reason
     return None
 

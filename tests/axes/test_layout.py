@@ -15,7 +15,7 @@ from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.objects import TEST_CATEGORIES, goes_with, models, taken
 from pipeline.config import ReplayConfig
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import PipelineError, RejectedError
 from pipeline.libero.arenas import ARENAS, Arena, Region
 from pipeline.libero.starts import HOME_RAD, recorded_start
 from pipeline.libero.tasks import tasks
@@ -285,7 +285,7 @@ def test_impossible_wishes_are_refused_with_their_reason(tmp_path: Path, base: S
     file = tmp_path / "crate.xml"
     file.write_text('<mujoco><worldbody><body><geom type="box" size=".25 .25 .25"/></body></worldbody></mujoco>')
     crate = ObjectModel("own/crate", "crate", "", "", file)
-    with pytest.raises(RefusedError) as refused:
+    with pytest.raises(RejectedError) as refused:
         place(base, demo, [crate] * 5, seed=0, roll_out=roll_out)
     assert refused.value.reason in ("layout_in_the_way", "layout_out_of_view", "layout_off_the_surface")
 

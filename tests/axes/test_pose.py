@@ -14,7 +14,7 @@ from pipeline.axes import from_json, to_json
 from pipeline.axes.base import Level
 from pipeline.axes.pose import BASE_M, Move, PoseAxis, PosePerturbation, ScenePerturbation
 from pipeline.config import ReplayConfig
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.physics.environment import Environment
@@ -133,7 +133,7 @@ def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
     ],
 )
 def test_what_cannot_be_is_refused(task: Task, change: PosePerturbation, reason: str, scenes: Scenes) -> None:
-    with pytest.raises(RefusedError, match=reason):
+    with pytest.raises(RejectedError, match=reason):
         change.apply(scenes(task), starter_demo(task), roll_out)
 
 
@@ -145,7 +145,7 @@ def test_a_receptacle_moves_when_asked_for_and_the_targets_relation_still_holds(
     assert not axis.applies(PLATE), "the plate goes to a place on the table"
     change = moved("plate_1", 0.01, 0.01, 5)
     assert change.apply(scenes(BETWEEN), starter_demo(BETWEEN), roll_out).resolved["pose"]["moved"] == "plate_1"
-    with pytest.raises(RefusedError, match="relation_broken"):
+    with pytest.raises(RejectedError, match="relation_broken"):
         moved("plate_1", 0.25).apply(scenes(NEXT_TO), starter_demo(NEXT_TO), roll_out)
 
 
@@ -305,7 +305,7 @@ def test_a_fixture_takes_along_what_stands_on_it(scenes: Scenes) -> None:
 def test_a_scene_that_cannot_be_is_refused(
     task: Task, moves: dict[str, tuple[float, float]], reason: str, scenes: Scenes
 ) -> None:
-    with pytest.raises(RefusedError, match=reason):
+    with pytest.raises(RejectedError, match=reason):
         together(**moves).apply(scenes(task), starter_demo(task), roll_out)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.axes.robot import RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.assets import relocate
 from pipeline.libero.starts import HOME_RAD, recorded_start
@@ -81,7 +81,7 @@ def test_nine_of_ten_initial_joints_start_within_10_cm(environment: Environment)
     away_m: dict[int, list[float]] = {level: [] for level in (1, 2, 3, 4, 5)}
     axis = RobotAxis(components=("initial_joints",))
     for p in draws(axis, 40):
-        with suppress(RefusedError):
+        with suppress(RejectedError):
             environment.restore(p.apply(start, starter_demo(PLATE), roll_out))
             environment.settle(10)
             away_m[p.level].append(float(np.linalg.norm(environment.hand[0] - unchanged_m)))
@@ -143,7 +143,7 @@ def test_what_cannot_be_is_refused(scene: Scene) -> None:
         ("robot_in_collision", (0, 0.9, 0, 0, 0, 0, 0)),
         ("test_posture", HOME_RAD + benchmark_offsets_rad()[99] - start),
     ):
-        with pytest.raises(RefusedError, match=reason):
+        with pytest.raises(RejectedError, match=reason):
             turned(*offsets).apply(scene, demo, roll_out)
 
 

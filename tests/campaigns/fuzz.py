@@ -288,7 +288,7 @@ def _read_recording(file: Path) -> object:
 
 def _read_model(file: Path) -> object:
     """Read a model as a replay does: relocate it, compile it with MuJoCo, and step it."""
-    from pipeline.errors import RefusedError
+    from pipeline.errors import RejectedError
     from pipeline.physics.environment import shared
 
     try:
@@ -299,7 +299,7 @@ def _read_model(file: Path) -> object:
     environment.restore(recorded_start(starter_demo(STOVE), relocate(text, str(file))))
     try:
         environment.step(np.zeros(7))
-    except RefusedError as error:
+    except RejectedError as error:
         raise PipelineError(error.reason, where=file) from error
     return None
 

@@ -11,7 +11,7 @@ from pipeline.axes import AXES, Perturbation, PhysicsPerturbation, from_json, in
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import roll_out
@@ -91,7 +91,7 @@ def test_a_target_cannot_be_moved_onto_an_added_object(base: Scene, crowded: Sce
     onto = PosePerturbation(
         component="target", level=5, moved="plate_1", dx_m=round(dx_m, 4), dy_m=round(dy_m, 4), dyaw_deg=0
     )
-    with pytest.raises(RefusedError, match="object_in_collision"):
+    with pytest.raises(RejectedError, match="object_in_collision"):
         onto.apply(crowded, demo, roll_out)
     onto.apply(base, demo, roll_out)
 
@@ -106,6 +106,6 @@ def test_an_arm_cannot_start_in_an_added_object(base: Scene, crowded: Scene, dem
     state[address : address + 3] = hand_m
     recorded_m = CompiledScene(base).data.body("gripper0_eef").xpos
     state[address : address + 3] += (hand_m - recorded_m) / np.linalg.norm(hand_m - recorded_m) * 0.1
-    with pytest.raises(RefusedError, match="robot_in_collision"):
+    with pytest.raises(RejectedError, match="robot_in_collision"):
         TURNED.apply(replace(crowded, state=state), demo, roll_out)
     TURNED.apply(crowded, demo, roll_out)

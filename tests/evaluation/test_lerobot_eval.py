@@ -17,7 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import environment
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.gym_environment import PerturbedLiberoEnv, identity_options
-from pipeline.evaluation.results import read, refuse_different, stored
+from pipeline.evaluation.results import read, reject_different, stored
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import libero_states
@@ -172,8 +172,8 @@ def test_limits_of_openvla_and_lerobot_are_not_compared(tmp_path: Path, monkeypa
     assert [row.step_limit for row, _ in both] == [1, 2]
     assert both[0][0].episode != both[1][0].episode
     with pytest.raises(PipelineError, match="step_limit 1 and 2"):
-        refuse_different(both)
-    refuse_different(both, across=["step_limit"])
+        reject_different(both)
+    reject_different(both, across=["step_limit"])
 
 
 def test_it_registers_where_lerobot_takes_environments() -> None:

@@ -35,7 +35,7 @@ from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobot
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run.export import export
-from pipeline.run.foreign import refuse_foreign_files
+from pipeline.run.foreign import reject_foreign_files
 
 DEMOS = {episode_id: f"libero_spatial/task/demo_{number // 2}" for number, episode_id in enumerate(IDS)}
 """Two episodes of each of three demonstrations."""
@@ -85,13 +85,13 @@ def test_split_keeps_order_and_balance() -> None:
 def test_each_suite_of_rlds_must_have_a_validation_split() -> None:
     """OpenVLA-OFT asks each set of a mixture for one."""
     options = ExportConfig.model_validate({"rlds": RldsConfig(name=NAME, validation=0.1), "lerobot": None})
-    options.refuse_too_few({"libero_goal": 10, "my_suite": 6})
+    options.reject_too_few({"libero_goal": 10, "my_suite": 6})
     with pytest.raises(PipelineError, match="no task has enough demonstrations"):
-        options.refuse_too_few({"libero_goal": 10, "my_suite": 4})
+        options.reject_too_few({"libero_goal": 10, "my_suite": 4})
     of_goal = options.model_copy(update={"where": Where(suite=("libero_goal",))})
-    of_goal.refuse_too_few({"libero_goal": 10, "my_suite": 4})
+    of_goal.reject_too_few({"libero_goal": 10, "my_suite": 4})
     of_one = ExportConfig.model_validate({"rlds": None, "lerobot": LeRobotConfig(name=NAME, validation=0.1)})
-    of_one.refuse_too_few({"libero_goal": 10, "my_suite": 4})
+    of_one.reject_too_few({"libero_goal": 10, "my_suite": 4})
 
 
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.05, 0.07, 0.1, 0.125, 0.15, 0.2, 0.3, 1 / 3, 0.34, 0.35, 0.5])
@@ -198,7 +198,7 @@ def test_what_is_held_out_of_v21_is_a_set_of_its_own(
     rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
     formats = ExportConfig.model_validate({"rlds": rlds, "lerobot": lerobot, "lerobot_v21": options})
     recipe.write({}, tmp_path / "finetune", formats, datasets_in(tmp_path))
-    refuse_foreign_files(tmp_path, ["finetune"])
+    reject_foreign_files(tmp_path, ["finetune"])
     if convention == "openpi":
         found = json.loads((tmp_path / "finetune" / OPENPI_ASSETS).read_text())["norm_stats"]
         for key, column in (("actions", "action"), ("state", "state")):

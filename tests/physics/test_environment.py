@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import STOVE
 
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.types import Scene, Task, Trajectory
@@ -114,7 +114,7 @@ def test_what_mujoco_resets_by_itself_is_unstable(stove: Environment, whole: dic
     trajectory = whole[STOVE]
     stove.restore(trajectory.scene)
     stove.sim.data.qvel[-1] = 1e8
-    with pytest.raises(RefusedError, match="simulation_unstable"):
+    with pytest.raises(RejectedError, match="simulation_unstable"):
         stove.step(trajectory.actions[0])
     stove.restore(trajectory.scene)
     stove.step(trajectory.actions[0])

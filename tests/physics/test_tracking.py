@@ -13,7 +13,7 @@ from pipeline.axes.base import PhysicsPerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
-from pipeline.errors import RefusedError
+from pipeline.errors import RejectedError
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Mask, Reference
 from pipeline.physics.replay import replay
@@ -167,7 +167,7 @@ def tilted(pose: Floats, angle_rad: float) -> Floats:
 
 def test_what_has_fallen_over_is_refused_where_the_hand_meets_it(milk: Reference) -> None:
     poses = {name: poses[0] for name, poses in milk.poses.items()}
-    with pytest.raises(RefusedError, match="object_not_upright"):
+    with pytest.raises(RejectedError, match="object_not_upright"):
         Route.through(milk, start_of(milk), poses | {"milk_1": tilted(poses["milk_1"], 0.5)})
     Route.through(milk, start_of(milk), poses | {"milk_1": tilted(poses["milk_1"], 0.1)})
     beside = next(name for name in poses if not milk.held[name].any() and not milk.met[name].any())

@@ -380,12 +380,12 @@ def test_an_overlap_is_explained_by_what_overlaps() -> None:
     scene = {**changed, "component": "scene", "moves": [{"name": "plate_1", "dx_m": 0.008, "dy_m": 0}]}
     rows = [row(task, from_json(json.dumps([fields])), str(fields["component"])) for fields in (one, scene)]
     with pytest.raises(PipelineError, match=r"1 of 2 .* \(such as scene, distance 0\.008, clearance 0\.01\)"):
-        leakage.refuse_overlap(leakage.check(rows, test))
+        leakage.reject_overlap(leakage.check(rows, test))
 
 
 def test_no_overlap_is_no_error(test: TestSet) -> None:
-    leakage.refuse_overlap({})
+    leakage.reject_overlap({})
     tested = test.on_axis("noise")[0]
     findings = leakage.check([row(find_task(tested.suite, tested.base), [repeated(tested)], "planted")], test)
     with pytest.raises(PipelineError, match="such as planted"):
-        leakage.refuse_overlap(findings)
+        leakage.reject_overlap(findings)

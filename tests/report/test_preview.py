@@ -25,7 +25,7 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.compute.pool import loop
 from pipeline.config import PlanConfig, load
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import PipelineError, RejectedError
 from pipeline.images.jpeg import decode, encode
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
@@ -82,7 +82,7 @@ class Lift(PhysicsPerturbation):
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         if self.level == 5:
-            raise RefusedError("too_high")
+            raise RejectedError("too_high")
         state = scene.state.copy()
         state[2] += 0.1 * self.level
         name = "other" if self.component == "window" else "model"
@@ -121,7 +121,7 @@ def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_
         try:
             after = stage.frames(VIEWS, perturbation)
             break
-        except RefusedError as refused:
+        except RejectedError as refused:
             reason = refused.reason
     else:
         pytest.fail(f"this scene refuses every draw: {reason}")

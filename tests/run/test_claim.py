@@ -22,7 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.generated import generated
 from pipeline.libero import hdf5
 from pipeline.planning import plan
-from pipeline.run.claim import LOCK, OWNER, claim_folder, locked, open_run, refuse_other_folder
+from pipeline.run.claim import LOCK, OWNER, claim_folder, locked, open_run, reject_other_folder
 
 
 @pytest.fixture
@@ -62,12 +62,12 @@ def test_a_copy_with_the_old_name_is_refused_before_anything_else(clone: Path) -
 def test_dvc_s_run_must_be_where_dvc_looks(clone: Path, field: str, value: str, message: str) -> None:
     file = Path("configs/tiny.yaml")
     Path("params.yaml").write_text("run: tiny\ndata: data\n")
-    refuse_other_folder(file)
+    reject_other_folder(file)
     file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), field: value}))
     with pytest.raises(PipelineError, match=message):
-        refuse_other_folder(file)
+        reject_other_folder(file)
     Path("params.yaml").write_text("run: starter\ndata: data\n")
-    refuse_other_folder(file)
+    reject_other_folder(file)
 
 
 def test_push_refuses_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -261,7 +261,7 @@ def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> 
     edited = config.model_dump(mode="json") | {"replay": {"mode": "open_loop", "settle_steps": 10}}
     with pytest.raises(AssertionError, match="the section replay has changed since the plan"):
         run_stages(clone, edited, [stage])
-    plan.refuse_other_settings(rows, config.replay)
+    plan.reject_other_settings(rows, config.replay)
 
 
 def test_a_plan_without_a_task_that_was_asked_for_is_refused(clone: Path) -> None:

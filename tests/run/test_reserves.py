@@ -38,7 +38,7 @@ def reserved(demos: Path) -> dict[str, object]:
     }
 
 
-def refuse_frames_of_first_candidate(clone: Path, fields: dict[str, object]) -> None:
+def reject_frames_of_first_candidate(clone: Path, fields: dict[str, object]) -> None:
     """Store what a render stage stores where no worker survives the frames of the first candidate of ``layout``."""
     config = Config.model_validate(fields)
     data = clone / config.data
@@ -76,7 +76,7 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
     made(clone, "replay")
     replayed = set((clone / "data/tiny/trajectories").glob("*.npz"))
     assert len(replayed) == 3, "the twin and the first candidates"
-    refuse_frames_of_first_candidate(clone, fields)
+    reject_frames_of_first_candidate(clone, fields)
     made(clone, "manifest")
     rows = manifest.read(clone / "data/tiny/manifest.parquet")
     lost = ["worker_lost", "kept", "reserve_not_needed"]

@@ -105,10 +105,10 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
     told = {f"files of frames, generated with {number}": 1}
     assert found == told | ({f"trajectories, generated with {number}": 1} if step == "physics" else {})
     with pytest.raises(PipelineError, match=rf"1 files of frames, generated with {number}(?s:.*)REMAKE=1` before"):
-        identity.refuse_unasked(found, tmp_path)
+        identity.reject_unasked(found, tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
     monkeypatch.setenv(identity.REMAKE, "1")
-    identity.refuse_unasked(found, tmp_path)
+    identity.reject_unasked(found, tmp_path)
     assert number in capsys.readouterr().out
     if step == "pixels":
         monkeypatch.delenv(identity.REMAKE)

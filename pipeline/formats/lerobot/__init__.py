@@ -75,7 +75,7 @@ class LeRobotConfig(FormatOptions):
             _require_lerobot_06("depth as video")
         return depth
 
-    def refuse_content(self, content: Content) -> None:
+    def reject_content(self, content: Content) -> None:
         if self.depth == "video" and "depth" not in content.extras:
             raise ValueError("export.lerobot.depth: video requires depth in render.extras, which does not list it")
 

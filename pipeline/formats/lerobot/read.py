@@ -116,7 +116,7 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
     info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)
     table = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
-    refuse_others(table, row, row["dataset_from_index"])
+    reject_others(table, row, row["dataset_from_index"])
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
     if row["dataset_to_index"] != row["dataset_from_index"] + steps or row["tasks"] != [instructions[0]]:
         stated = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
@@ -192,7 +192,7 @@ def _stated(file: Edition) -> tuple[pa.Table, dict[int, int]]:
     return table.select(names), places
 
 
-def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> None:
+def reject_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> None:
     """Reject steps that are not exactly those of an episode, by the steps' own numbers and id.
 
     Args:
@@ -371,7 +371,7 @@ def _copy_v21(
 ) -> Copy:
     index = row["episode_index"]
     stored = pq.read_table(root / data_path_v21(index))
-    refuse_others(stored, row, row["first_step"])
+    reject_others(stored, row, row["first_step"])
     instructions = [tasks[task] for task in stored["task_index"].to_pylist()]
     if row["tasks"] != [instructions[0]]:
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
