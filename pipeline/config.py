@@ -273,7 +273,8 @@ class Config(Frozen):
     Attributes:
         name: Name of the run and of its folder: at most 60 small letters, digits and underscores, beginning with a
             letter.
-        folder: Folder that contains the folder of the run; ``data`` by default.
+        folder: Folder that contains the folder of the run; ``data`` by default. The parent of an absolute path outside
+            of the home folder must exist.
         demos: Demonstrations that the run perturbs; by default the starter set of the four suites.
         plan: Episodes to plan from the demonstrations.
         replay: Options of the replay of demonstrations.
@@ -457,24 +458,32 @@ def read_content(path: Path) -> Any:
         raise PipelineError(
             "there is no such configuration",
             where=path,
-            expected=f"did you mean {similar[0]}?" if similar else f"a file such as {', '.join(files)}",
+            expected=f"did you mean {similar[0]}?" if similar else ", ".join(files) or "the path of a YAML file",
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise PipelineError(
             f"cannot read the configuration ({error})", where=path, expected="a text file in UTF-8"
         ) from error
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f" in line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         raise PipelineError(
-            f"the file is not valid YAML{place}: {error.problem}",
+            f"the file is not valid YAML: {_yaml_fault(error)}",
             where=path,
-            expected="fields as in configs/starter.yaml, with spaces as indents, not tabs",
+            expected="fields as in configs/starter.yaml",
+            remedy="use spaces as indents" if "'\\t'" in str(error.problem) else None,
         ) from error
     except (yaml.YAMLError, RecursionError) as error:
         raise PipelineError(
             f"the file is not valid YAML: {error}", where=path, expected="a file such as configs/starter.yaml"
         ) from error
+
+
+def _yaml_fault(error: yaml.MarkedYAMLError) -> str:
+    """Describe a fault with its place, and the place where the faulty part begins."""
+    parts: list[str] = []
+    for text, mark in ((error.problem, error.problem_mark), (error.context, error.context_mark)):
+        if text:
+            parts.append(f"{text} in line {mark.line + 1}, column {mark.column + 1}" if mark else text)
+    return ", ".join(parts)
 
 
 def validate(content: Any, path: Path) -> Config:

@@ -82,8 +82,8 @@ class Perturbation(Frozen):
         measure: definition of the distance to a test task.
         unit: unit of this distance; ``None`` if the distance is only 0 for equal changes and positive for others.
         clearance: least distance to any test task; a perturbation that comes closer is sampled again.
-        same: the property that two changes must share to be compared: the LIBERO task or its initial scene. ``None``
-            if all changes can be compared.
+        same: the property that two changes must share to be compared: the LIBERO task, its instruction or its initial
+            scene. ``None`` if all changes can be compared.
         can_hide: true if it can hide the hand or the task's things from the agent view.
     """
 

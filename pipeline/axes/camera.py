@@ -380,7 +380,7 @@ class CameraAxis(Axis):
                 raise PipelineError(
                     f"no {component} camera of level {', '.join(map(str, near))} within the ranges is at least "
                     f"{CameraPerturbation.clearance:g} degrees from all test cameras",
-                    where="plan.axes.camera",
+                    where=f"plan.axes.camera, task {task}",
                     expected="components that can change together with it, with ranges that reach 5 degrees",
                     remedy="add components or widen the ranges; or set clear_by: off, so that training cameras may "
                     "equal test cameras",

@@ -19,5 +19,3 @@ ROBOMIMIC_CONFIG = "robomimic.json"
 
 OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
 """Path of the statistics below the configuration's assets folder; the configuration reads it to serve a policy."""
-
-"""All names. Other files in the folder are foreign, and no stage and no command deletes them."""

@@ -76,6 +76,8 @@ class LazyGroup(click.Group):
                 module = importlib.import_module(f"pipeline.commands.{commands[name].module}")
                 command: click.Command = getattr(module, name.replace("-", "_"))
                 return command
+        if context.resilient_parsing:  # A shell completes words: errors would be printed in the middle of its line.
+            return None
         if name in self.moved:
             raise click.UsageError(f"the command `{name}` is now `{self.moved[name]}`", context)
         similar = get_close_matches(name, self.list_commands(context), n=1)

@@ -52,8 +52,8 @@ class Selection(Frozen, use_attribute_docstrings=True):
 
     source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
     """LIBERO's tasks and the user's own; LIBERO-Plus's test tasks; held-out perturbations on this project's axes
-    (``own``); LIBERO's scenes with another goal, an object of the scene or a held-out pair of the axis goal
-    (``goals``); for every two axes the task, a
+    (``own``); LIBERO's scenes with another goal: another object of the scene, or a held-out pair of the axis
+    goal (``goals``); for every two axes the task, a
     held-out perturbation on either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
     """list of tasks that ``analyze construct`` wrote, in place of a source"""

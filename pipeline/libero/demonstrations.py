@@ -200,11 +200,11 @@ class HDF5Source:
             try:
                 with self._data(task) as data:
                     usable, unusable = self._index_file(task, data, per_task, first_with, remarks)
+                entries += usable
+                problems += unusable
                 notes += self._notes(task, remarks)
             except PipelineError as error:
-                usable, unusable = [], [Problem(str(task), error)]
-            entries += usable
-            problems += unusable
+                problems.append(Problem(str(task), error))
         return DemoIndex(entries, problems, tuple(notes))
 
     def _index_file(

@@ -108,7 +108,7 @@ def open_run(file: Path) -> Run:
         PipelineError: when the configuration is not valid, or the folder belongs to another file.
     """
     config = load(file)
-    _reject_missing_disk(config, file)
+    _reject_missing_parent(config, file)
     if (config.data / OWNER).exists():
         _reject_other_owner(config, file)
     return Run(config)
@@ -170,21 +170,30 @@ def reject_other_folder(file: Path) -> None:
         )
 
 
-def _reject_missing_disk(config: Config, file: Path) -> None:
-    """Reject a mistyped absolute path, below which a run would fill the disk of the system."""
-    if config.folder.is_absolute() and not config.folder.parent.exists():
+def missing_parent(folder: Path) -> Path | None:
+    """Return the parent of an absolute folder outside of the home folder if it does not exist.
+
+    With a mistyped path, a run would fill the disk of the system.
+    """
+    is_elsewhere = folder.is_absolute() and not folder.is_relative_to(Path.home())
+    return folder.parent if is_elsewhere and not folder.parent.exists() else None
+
+
+def _reject_missing_parent(config: Config, file: Path) -> None:
+    missing = missing_parent(config.folder)
+    if missing is not None:
         raise PipelineError(
-            f"folder: {config.folder.parent} does not exist",
+            f"folder: {missing} does not exist",
             where=file,
             expected="a folder in an existing one",
-            remedy=f"correct `folder:`, or create {config.folder.parent}",
+            remedy=f"correct `folder:`, or create {missing}",
         )
 
 
 def _reject_other_owner(config: Config, file: Path) -> None:
     """Reject a folder that must not be given to a configuration file."""
     folder = config.data
-    _reject_missing_disk(config, file)
+    _reject_missing_parent(config, file)
     reject_unmarked(folder)
     _reject_folder_in_run(folder)
     mark = _mark(folder)

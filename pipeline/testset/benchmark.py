@@ -67,7 +67,7 @@ class TestSet:
         return self._by_axis.get(axis, ())
 
     def on(self, task: Task, axis: str, same: Same = "task") -> tuple[TestTask, ...]:
-        """Return the test tasks of one axis that perturb ``task``, or any task with the same scene."""
+        """Return the test tasks of one axis that perturb ``task``, or a task with the same property ``same``."""
         tests = self.on_axis(axis)
         return tuple(tests[place] for place in self.places(task, axis, same))
 

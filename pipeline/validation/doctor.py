@@ -31,6 +31,7 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.origins import REINSTALL
 from pipeline.run import dropped, machine, plan_stage
+from pipeline.run.claim import missing_parent
 from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import outdated
 from pipeline.run.run import Run
@@ -322,6 +323,10 @@ def _has_pip() -> bool:
 
 
 def _disk(run: Run, need_gb: float) -> Diagnosis:
+    missing = missing_parent(run.config.folder)
+    if missing is not None:
+        remedy = f"correct `folder:` in the configuration, or create {missing}"
+        return Diagnosis("disk", "fail", f"{missing} does not exist", remedy)
     there_gb = free_gb(run.folder)
     detail = f"{there_gb:.1f} GB free at {run.folder}, {need_gb:.1f} GB needed"
     # Only a plan shows which datasets change, so the largest one counts.

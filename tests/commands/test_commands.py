@@ -123,6 +123,9 @@ def test_an_error_while_a_command_is_imported_has_its_remedy_too() -> None:
         ("perturbed-libero dataset ", 2, {"check", "audit", "regenerate", "compare-frame", "push"}),
         ("perturbed-libero preview TASK c", 3, {"camera"}),
         ("perturbed-libero clean --only t", 3, {"trajectories", "tables"}),
+        # A misspelled and a moved command: as after the name of the program.
+        ("perturbed-libero runn s", 2, {"status", "sources", "schema"}),
+        ("perturbed-libero audit s", 2, {"status", "sources", "schema"}),
     ],
 )
 def test_a_shell_completes_commands_and_names(words: str, position: int, offered: set[str]) -> None:

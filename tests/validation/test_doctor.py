@@ -67,6 +67,15 @@ def test_a_machine_that_was_set_up_is_fine(tmp_path: Path) -> None:
     assert failures(tmp_path) == {}
 
 
+def test_a_mistyped_absolute_folder_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    link_testset(tmp_path)
+    missing = tmp_path / "dsik"
+    assert run_doctor("starter", monkeypatch, free_gb=1, folder=missing / "data") == ["disk"]
+    missing.mkdir()
+    assert run_doctor("starter", monkeypatch, free_gb=1, folder=missing / "data") == []
+
+
 def test_disk_is_asked_for_as_the_configuration_needs_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -315,7 +324,7 @@ def test_a_run_goes_on_where_steps_and_frames_are_the_same(
     stored(config.data, "trajectories", "frames")
     assert run_doctor("starter", monkeypatch, free_gb=1) == []
     trial["one frame"] = "89ab"
-    assert run_doctor("starter", monkeypatch, free_gb=1) != []
+    assert run_doctor("starter", monkeypatch, free_gb=1) == ["same machine"]
     shown = capsys.readouterr().err
     assert "fail  same machine" in shown
     assert "4567" in shown
@@ -376,4 +385,4 @@ def test_a_damaged_file_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     folder = stored(tmp_path / "data" / "starter", "frames")
     file = folder / "frames" / "0123" / "4567.npz"
     file.write_bytes(file.read_bytes()[:-100])
-    assert run_doctor("starter", monkeypatch, free_gb=1) != []
+    assert run_doctor("starter", monkeypatch, free_gb=1) == ["finished work"]

@@ -80,7 +80,7 @@ def check(
 ) -> Iterator[tuple[str, Fault]]:
     """Compare a dataset's metadata with the content of its files.
 
-    The check covers every field of ``meta/info.json`` and ``modality.json``, the tasks, the splits, the files, and the
+    The check covers every field of ``meta/info.json``, the tasks, the splits, the files, and the
     videos' own properties. It computes the statistics of all columns again. lerobot opens the dataset; its numbers and
     frames of samples must equal those of ``read.read``.
 
@@ -279,8 +279,8 @@ def check_v21(
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
-    The check covers every field of ``meta/info.json``, the tasks, the splits, the files of every episode, and the
-    videos' own properties. It computes the statistics of all columns again.
+    The check covers every field of ``meta/info.json`` and ``modality.json``, the tasks, the splits, the files of every
+    episode, and the videos' own properties. It computes the statistics of all columns again.
 
     Raises:
         PipelineError: when a set cannot be opened.
