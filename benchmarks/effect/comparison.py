@@ -8,6 +8,7 @@ from typing import Any
 
 from instructions import at_own_place
 from results import PolicyResults, join, read
+from scipy.stats import binomtest
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult, Trial
@@ -199,9 +200,10 @@ def reading_by_kind(results: Sequence[PolicyResults], arm: str) -> dict[str, Cou
 
 
 def _readings(results: Sequence[PolicyResults], arm: str) -> Iterator[dict[str, Any]]:
+    """Yield the episodes with instructions in LIBERO's words."""
     for policy in results:
         if policy.arm == arm:
-            yield from policy.reading
+            yield from (row for row in policy.reading if row["kind"] != "rewrite")
 
 
 def markdown(results: Sequence[PolicyResults]) -> str:
@@ -215,7 +217,11 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     if rows:
         text += "\nSuccess on LIBERO-Plus's tests of tasks whose first state a policy solves unperturbed:\n\n"
         text += _table(rows)
-    readings = chain.from_iterable(policy.reading for policy in results)
+    rows = _rewrite_rows(results)
+    if rows:
+        text += "\nSuccess with LIBERO-Plus's rewrites from several of LIBERO's initial states, and with LIBERO's "
+        text += "instruction from the same states:\n\n" + _table(rows)
+    readings = chain.from_iterable(_readings(results, arm) for arm in arms_of(results))
     if len({row["scene"] for row in readings}) > 1:
         text += "\nReached goals by instruction, all scenes and seeds together:\n\n"
         return text + _table(_kind_rows(results))
@@ -261,6 +267,29 @@ def _first_state_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
         if episodes:
             rows.append([axis, str(episodes), *map(_rates, of_arms.values())])
     return rows
+
+
+def _rewrite_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
+    """Return the success with rewrites from several initial states by arm; an empty list without such episodes.
+
+    ``p`` is that of McNemar's exact test of both instructions, over all seeds.
+    """
+    rows = [["arm", "episodes", "rewrite", "LIBERO's", "only the rewrite", "only LIBERO's", "p"]]
+    for arm in arms_of(results):
+        by_seed: list[list[tuple[bool, bool]]] = []
+        for policy in results:
+            if policy.arm == arm:
+                plain = {(row.base, row.number): row.success for row in policy.rows if row.source == "libero"}
+                rewritten = [row for row in policy.reading if row["kind"] == "rewrite"]
+                outcomes = [(row["reached"] == row["asked"], plain[row["asked"], row["state"]]) for row in rewritten]
+                by_seed.append(outcomes)
+        every = list(chain(*by_seed))
+        if every:
+            gained, lost = every.count((True, False)), every.count((False, True))
+            p_value = binomtest(gained, gained + lost).pvalue if gained + lost else 1.0
+            rates = [_rates([[outcome[place] for outcome in seed] for seed in by_seed]) for place in (0, 1)]
+            rows.append([arm, str(len(by_seed[0])), *rates, str(gained), str(lost), f"{p_value:.2g}"])
+    return rows if len(rows) > 1 else []
 
 
 def _difference_rows(results: Sequence[PolicyResults]) -> list[list[str]]:

@@ -1,7 +1,8 @@
 """Evaluation of each policy: test tasks by ``python -m pipeline evaluate``, and its obedience to instructions.
 
 In one scene, tasks differ by the instruction alone. From the same initial states, the policy gets each instruction of
-the scene, and the empty one. The result is the first of the scene's goals that it reaches.
+the scene, and the empty one. It also gets rewrites of each task's instruction, each from another initial state. The
+result is the first of the scene's goals that it reaches.
 """
 
 from collections.abc import Hashable, Sequence
@@ -24,6 +25,7 @@ from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, balanced, goal_task, libero_task
 from pipeline.files import read_json, write_json
 from pipeline.libero.carried import carried, definition_of
+from pipeline.testset import benchmark
 from pipeline.types import Task
 
 CANDIDATES_OF_A_TEST = 5
@@ -103,10 +105,25 @@ class InstructedEpisode:
 
 
 def instructed_episodes(experiment: Experiment) -> list[InstructedEpisode]:
-    """Combine each scene's instructions with its last initial states."""
-    instructions = every_instruction(find_tasks(experiment.tasks))
-    states = range(INITIAL_STATES - experiment.evaluation.reading_states, INITIAL_STATES)
-    return [InstructedEpisode(instruction, state) for instruction, state in product(instructions, states)]
+    """Combine each scene's instructions with its last initial states, and each task's rewrites with its first ones."""
+    tasks, wanted = find_tasks(experiment.tasks), experiment.evaluation
+    states = range(INITIAL_STATES - wanted.reading_states, INITIAL_STATES)
+    episodes = [
+        InstructedEpisode(instruction, state) for instruction, state in product(every_instruction(tasks), states)
+    ]
+    for task in tasks if wanted.rewrite_states else ():
+        for state, text in enumerate(_rewrites(task, wanted.libero_plus["language"])[: wanted.rewrite_states]):
+            episodes.append(InstructedEpisode(Instruction(task, task, "rewrite", text), state))
+    return episodes
+
+
+def _rewrites(task: Task, number: int) -> list[str]:
+    """List the rewrites in a number of LIBERO-Plus's tests of a task, which ``tested`` selects, too."""
+    tests = select(
+        Selection(source="libero_plus", suites=(task.suite,), tasks=(task.name,), axes=("language",), subset=number)
+    )
+    found = benchmark.load()
+    return [str(found.find(test.suite, test.name).parameters["text"]) for test in tests]
 
 
 def run_instructed_episodes(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import date
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import yaml
 from instructions import every_instruction, find_tasks
@@ -61,6 +61,8 @@ class EvaluationConfig(Frozen):
         held_out_goals: number of LIBERO's initial states of each scene, counted from the first, with each goal that no
             plan carries to the scene.
         reading_states: number of initial states of each scene, counted from the last, with each instruction.
+        rewrite_states: number of LIBERO-Plus's rewrites of each task that begin in different initial states, counted
+            from the first. LIBERO-Plus's own tests of rewrites all begin in the first one.
     """
 
     states: int = Field(ge=1, le=50)
@@ -68,6 +70,14 @@ class EvaluationConfig(Frozen):
     held_out: dict[HeldOutAxis, int] = Field(default_factory=dict)
     held_out_goals: int = Field(default=0, ge=0, le=50)
     reading_states: int = Field(ge=0, le=50)
+    rewrite_states: int = Field(default=0, ge=0, le=50)
+
+    @model_validator(mode="after")
+    def _rewrites_have_a_state_and_a_text(self) -> Self:
+        most = min(self.states, self.libero_plus.get("language", 0))
+        if self.rewrite_states > most:
+            raise ValueError(f"rewrite_states is {self.rewrite_states}, but at most {most} by states and language")
+        return self
 
     def episodes(self, names: Sequence[str]) -> int:
         """Return the number of episodes of the tasks with these names, without those with black views."""
@@ -75,6 +85,7 @@ class EvaluationConfig(Frozen):
         goals = sum(instruction.kind == "held out" for instruction in instructions)
         return (
             len(names) * (self.states + sum(self.libero_plus.values()) + sum(self.held_out.values()))
+            + len(names) * self.rewrite_states
             + goals * self.held_out_goals
             + len(instructions) * self.reading_states
         )

@@ -17,9 +17,9 @@ from pipeline.types import Task
 SAME_PLACE_M = 0.05
 """Distance below which two places of a thing count as equal."""
 
-Kind = Literal["own", "carried", "held out", "nothing"]
-"""Kind of an instruction in a scene: LIBERO's own, another task's that plans may carry there, another task's that no
-plan carries there, or the empty instruction."""
+Kind = Literal["own", "rewrite", "carried", "held out", "nothing"]
+"""Kind of an instruction in a scene: LIBERO's own, a rewrite of it, another task's that plans may carry there, another
+task's that no plan carries there, or the empty instruction."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,17 @@ class Instruction:
         scene: the experiment's first task that begins in the scene.
         asked: the task whose instruction it is; ``None`` for the empty instruction.
         kind: kind of the instruction.
+        rewrite: text of the kind ``rewrite``; empty for the others.
     """
 
     scene: Task
     asked: Task | None
     kind: Kind
+    rewrite: str = ""
 
     @property
     def text(self) -> str:
-        return self.asked.instruction if self.asked else ""
+        return self.rewrite or (self.asked.instruction if self.asked else "")
 
 
 def find_tasks(names: Sequence[str]) -> list[Task]:

@@ -211,6 +211,10 @@ def test_the_arms_for_gpus_are_those_of_the_table(shipped: Experiment) -> None:
         ({"arms": {"clean": [], "ours": ["camera+robot"]}}, "plans no episodes of 'robot.camera' for ours"),
         ({"arms": {"clean": [], "ours": ["colour"]}}, "colour"),
         ({"demonstrations": 40}, "128 perturbed of 160 episodes; a third must stay clean: lower plan.episodes"),
+        (
+            {"evaluation": {"states": 9, "libero_plus": {"language": 4}, "reading_states": 0, "rewrite_states": 5}},
+            "at most 4 by states",
+        ),
         ({"evaluation": {"states": 50, "libero_plus": {"robot": 12}, "reading_states": 30}}, "398 .* at most 350"),
     ],
 )
@@ -363,7 +367,10 @@ def small(folder: Path, demos: Path) -> Path:
             **{"n_encoder_layers": 1, "use_vae": False, "dropout": 0.0},
         },
         "training": {"steps": 4, "batch_size": 2, "learning_rate": 1e-3, "save_every": 2, "proprioception": "relative"},
-        "evaluation": {"states": 1, "libero_plus": {}, "held_out": {"light": 1}, "reading_states": 1},
+        "evaluation": {
+            **{"states": 1, "libero_plus": {"language": 1}, "held_out": {"light": 1}},
+            **{"reading_states": 1, "rewrite_states": 1},
+        },
     }
     file = folder / "experiment.yaml"
     file.write_text(yaml.safe_dump(settings))
@@ -494,12 +501,18 @@ def test_from_demonstrations_to_the_results(
     command.main()
     (found,) = results.read(kept)
     outcomes = [(row.source, row.axis, row.reason, row.steps, row.looks) for row in found.rows]
-    assert outcomes == [("libero", "clean", "step_limit", 50, 2), ("own", "light", "step_limit", 50, 2)]
-    assert ("plan" in found.rows[0].settings, "plan" in found.rows[1].settings) == (False, True)
+    assert outcomes == [
+        ("libero", "clean", "step_limit", 50, 2),
+        ("libero_plus", "language", "step_limit", 50, 2),
+        ("own", "light", "step_limit", 50, 2),
+    ]
+    assert ["plan" in row.settings for row in found.rows] == [False, False, True]
     assert [(one["state"], one["instruction"], one["reached"], one["steps"]) for one in found.reading] == [
         (49, "turn on the stove", None, 50),
         (49, "", None, 50),
+        (0, found.rows[1].instruction, None, 50),
     ]
+    assert found.rows[1].instruction not in ("", "turn on the stove")
     assert found.black == [{"task": STOVE.name, "state": 0, "success": False}]
     assert found.made["episodes_by_axis"] == {"clean": 1, "noise": 1}
     (dataset,) = Path("data/effect/datasets").glob("more_*.npz")

@@ -72,6 +72,23 @@ def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
             results.read(tmp_path)
 
 
+def test_rewrites_are_compared_with_liberos_instruction_from_the_same_states() -> None:
+    """Four states, two seeds: three solved by one instruction alone, once by the rewrite."""
+    by_rewrite = {0: (True, True, False, False), 1: (True, False, False, False)}
+    policies = []
+    for seed, reached in by_rewrite.items():
+        policy = of_policy("clean", seed, 4)
+        rows = [row("clean", number, number in (0, 2), "clean") for number in range(4)]
+        rewritten = [
+            reading_row("stove", "rewrite", "stove", "stove" if reached[state] else None) | {"state": state}
+            for state in range(4)
+        ]
+        policies.append(replace(policy, rows=rows, reading=[*policy.reading, *rewritten]))
+    text = comparison.markdown(policies)
+    assert "| clean | 4 | 38 % (50, 25) | 50 % (50, 50) | 1 | 2 | 1 |" in text
+    assert text.count("rewrite") == 3, "in no other table"
+
+
 def test_the_table_pairs_episodes_seed_by_seed() -> None:
     found = [of_policy("clean", 0, 4), of_policy("clean", 1, 2), of_policy("ours", 0, 9), of_policy("ours", 1, 9)]
     robot = next(one for one in comparison.differences(found) if one["line"] == "robot")
