@@ -187,9 +187,10 @@ def attributions(rows: Iterable[Mapping[str, Any]]) -> dict[Credit, int]:
     """
     counts: Counter[Credit] = Counter()
     for row in rows:
-        task = task_of(row["suite"], row["task"], row["perturbations"])
-        credits = [perturbation.credits(task) for perturbation in from_json(row["perturbations"])]
-        counts.update({*chain(*credits)})
+        perturbations = from_json(row["perturbations"])
+        if perturbations:
+            task = task_of(row["suite"], row["task"], row["perturbations"])
+            counts.update({*chain(*(perturbation.credits(task) for perturbation in perturbations))})
     return dict(sorted(counts.items(), key=lambda item: (item[0].kind, *item[0])))
 
 

@@ -164,7 +164,7 @@ FAULTS = {
     "normal map": "its name is that of a data map",
     "not an image": "the file is not a readable image",
     "empty": "the folder has no images",
-    "missing": "the folder has no images",
+    "missing": "there is no such folder",
 }
 
 
