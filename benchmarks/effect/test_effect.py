@@ -54,7 +54,7 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
     names = {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes", "axes_relative", "object", "spatial"}
-    names.add("focus_object")
+    names |= {"focus_object", "object_long"}
     assert further.keys() == names
     axes, relative = further.pop("axes"), further.pop("axes_relative")
     assert relative == axes.model_copy(update={"arms": relative.arms, "training": relative.training})
@@ -79,6 +79,12 @@ def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> N
         assert group.training == axes.training.model_copy(update={"steps": 8_000})
         same = {"demos": {"tasks"}}
         assert group.run.model_dump(exclude=same) == groups[0].run.model_dump(exclude=same)
+    longer = further.pop("object_long")
+    more = {
+        "training": groups[0].training.model_copy(update={"steps": 16_000}),
+        "decisions": groups[0].decisions | longer.decisions,
+    }
+    assert longer == groups[0].model_copy(update=more)
     focused = further.pop("focus_object")
     added = {"further": focused.further, "decisions": focused.decisions}
     assert focused == groups[0].model_copy(update=added)
