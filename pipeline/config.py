@@ -466,7 +466,7 @@ def read_content(path: Path) -> Any:
         ) from error
     except yaml.MarkedYAMLError as error:
         raise PipelineError(
-            f"the file is not valid YAML: {_yaml_fault(error)}",
+            f"the file is not valid YAML: {_describe_yaml_fault(error)}",
             where=path,
             expected="fields as in configs/starter.yaml",
             remedy="use spaces as indents" if "'\\t'" in str(error.problem) else None,
@@ -477,7 +477,7 @@ def read_content(path: Path) -> Any:
         ) from error
 
 
-def _yaml_fault(error: yaml.MarkedYAMLError) -> str:
+def _describe_yaml_fault(error: yaml.MarkedYAMLError) -> str:
     """Describe a fault with its place, and the place where the faulty part begins."""
     parts: list[str] = []
     for text, mark in ((error.problem, error.problem_mark), (error.context, error.context_mark)):

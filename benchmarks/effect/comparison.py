@@ -276,19 +276,21 @@ def _rewrite_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     """
     rows = [["arm", "episodes", "rewrite", "LIBERO's", "only the rewrite", "only LIBERO's", "p"]]
     for arm in arms_of(results):
-        by_seed: list[list[tuple[bool, bool]]] = []
+        with_rewrite: list[list[bool]] = []
+        with_original: list[list[bool]] = []
         for policy in results:
-            if policy.arm == arm:
-                plain = {(row.base, row.number): row.success for row in policy.rows if row.source == "libero"}
-                rewritten = [row for row in policy.reading if row["kind"] == "rewrite"]
-                outcomes = [(row["reached"] == row["asked"], plain[row["asked"], row["state"]]) for row in rewritten]
-                by_seed.append(outcomes)
-        every = list(chain(*by_seed))
-        if every:
-            gained, lost = every.count((True, False)), every.count((False, True))
+            if policy.arm != arm:
+                continue
+            solved = {(row.base, row.number): row.success for row in policy.rows if row.source == "libero"}
+            rewritten = [row for row in policy.reading if row["kind"] == "rewrite"]
+            with_rewrite.append([row["reached"] == row["asked"] for row in rewritten])
+            with_original.append([solved[row["asked"], row["state"]] for row in rewritten])
+        outcomes = Counter(zip(chain(*with_rewrite), chain(*with_original), strict=True))
+        if outcomes:
+            gained, lost = outcomes[True, False], outcomes[False, True]
             p_value = binomtest(gained, gained + lost).pvalue if gained + lost else 1.0
-            rates = [_rates([[outcome[place] for outcome in seed] for seed in by_seed]) for place in (0, 1)]
-            rows.append([arm, str(len(by_seed[0])), *rates, str(gained), str(lost), f"{p_value:.2g}"])
+            rates = [_rates(with_rewrite), _rates(with_original)]
+            rows.append([arm, str(len(with_rewrite[0])), *rates, str(gained), str(lost), f"{p_value:.2g}"])
     return rows if len(rows) > 1 else []
 
 

@@ -111,13 +111,16 @@ def instructed_episodes(experiment: Experiment) -> list[InstructedEpisode]:
     episodes = [
         InstructedEpisode(instruction, state) for instruction, state in product(every_instruction(tasks), states)
     ]
-    for task in tasks if wanted.rewrite_states else ():
-        for state, text in enumerate(_rewrites(task, wanted.libero_plus["language"])[: wanted.rewrite_states]):
+    if not wanted.rewrite_states:
+        return episodes
+    for task in tasks:
+        rewrites = _list_rewrites(task, wanted.libero_plus["language"])
+        for state, text in enumerate(rewrites[: wanted.rewrite_states]):
             episodes.append(InstructedEpisode(Instruction(task, task, "rewrite", text), state))
     return episodes
 
 
-def _rewrites(task: Task, number: int) -> list[str]:
+def _list_rewrites(task: Task, number: int) -> list[str]:
     """List the rewrites in a number of LIBERO-Plus's tests of a task, which ``tested`` selects, too."""
     tests = select(
         Selection(source="libero_plus", suites=(task.suite,), tasks=(task.name,), axes=("language",), subset=number)

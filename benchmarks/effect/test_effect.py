@@ -53,8 +53,19 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
-    names = {"pre_norm", "no_state", "starts", "goals", "goals_many", "axes", "axes_relative", "object", "spatial"}
-    names |= {"focus_object", "object_long"}
+    names = {
+        "pre_norm",
+        "no_state",
+        "starts",
+        "goals",
+        "goals_many",
+        "axes",
+        "axes_relative",
+        "object",
+        "spatial",
+        "object_long",
+        "focus_object",
+    }
     assert further.keys() == names
     axes, relative = further.pop("axes"), further.pop("axes_relative")
     assert relative == axes.model_copy(update={"arms": relative.arms, "training": relative.training})

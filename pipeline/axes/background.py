@@ -75,7 +75,7 @@ class Covering(Frozen):
     """Texture on one part of the scene.
 
     Attributes:
-        part: covered part. Not every scene shows it (``BackgroundPerturbation.shown``).
+        part: covered part. Not every scene shows it (``BackgroundPerturbation.list_shown``).
         texture: name in the sources of :mod:`pipeline.catalogue.textures`.
         licence: licence that the texture's source states.
         sha256: hash of the texture.
@@ -148,14 +148,14 @@ class BackgroundPerturbation(RenderPerturbation):
         """Hashes of the textures."""
         return {covering.sha256 for covering in self.coverings}
 
-    def shown(self, task: Task) -> tuple[Covering, ...]:
+    def list_shown(self, task: Task) -> tuple[Covering, ...]:
         """Return the coverings of the parts that the scene of a task has."""
         absent = ABSENT_PARTS[bddl.read(task.bddl_file).arena]
         return tuple(covering for covering in self.coverings if covering.part not in absent)
 
     def credits(self, task: Task) -> frozenset[Credit]:
         """List the textures that the scene of ``task`` shows, with their licences."""
-        return frozenset(Credit(c.texture, "texture", c.licence, c.author) for c in self.shown(task))
+        return frozenset(Credit(c.texture, "texture", c.licence, c.author) for c in self.list_shown(task))
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Measure the changed share of each view."""
@@ -252,7 +252,7 @@ class BackgroundAxis(Axis):
         """Describe a plot of the images by source and family."""
         names: list[str] = []
         for item in kept:
-            names += [covering.texture for covering in item.perturbation.shown(item.task)]
+            names += [covering.texture for covering in item.perturbation.list_shown(item.task)]
         tested = test.on_axis("background")
         images = set()
         for task in tested:

@@ -47,7 +47,8 @@ def axes() -> None:
     for axis in AXES:
         kind = AXES[axis].draws[0]
         components = ", ".join(components_of(axis))
-        table.add_row(axis, components, kind.layer.name.lower(), names_of_views[kind.views])
+        views = names_of_views.get(kind.views) or ", ".join(sorted(kind.views))
+        table.add_row(axis, components, kind.layer.name.lower(), views)
     Console(highlight=False).print(table)
     print("Ranges and levels: see docs/configuration.md and docs/axes.md.")
     print("Pictures of an axis: see `python -m pipeline preview --help`.")

@@ -383,8 +383,8 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
     name_parts = [alike[0].policy]
     for key, value in settings.items():
         if any(row.settings.get(key) != value for row in alike):
-            shown = value[:8] if key == "plan" else value  # A digest.
-            name_parts.append(f"{key.replace('_', ' ')} {shown}")
+            text = value[:8] if key == "plan" else value  # The plan is given by a long digest.
+            name_parts.append(f"{key.replace('_', ' ')} {text}")
     videos = {row.episode: files.video(row.episode) for row, files in group}
     return Evaluated(
         name=", ".join(name_parts),

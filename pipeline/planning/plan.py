@@ -93,11 +93,11 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     for group in by_task.values():
         rows += twins(group, plan.seed, replay)
     for name in plan.episodes:
-        rows += _rows_of_entry(name, by_task, plan, replay, test)
+        rows += _plan_entry(name, by_task, plan, replay, test)
     return rows
 
 
-def _rows_of_entry(
+def _plan_entry(
     name: str, by_task: Mapping[Task, Sequence[DemoEntry]], plan: PlanConfig, replay: ReplayConfig, test: TestSet
 ) -> list[Row]:
     """Sample the candidates of one entry of ``plan.episodes``, task by task.

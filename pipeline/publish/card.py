@@ -187,10 +187,13 @@ def attributions(rows: Iterable[Mapping[str, Any]]) -> dict[Credit, int]:
     """
     counts: Counter[Credit] = Counter()
     for row in rows:
+        works: set[Credit] = set()
         perturbations = from_json(row["perturbations"])
         if perturbations:
             task = task_of(row["suite"], row["task"], row["perturbations"])
-            counts.update({*chain(*(perturbation.credits(task) for perturbation in perturbations))})
+            for perturbation in perturbations:
+                works |= perturbation.credits(task)
+        counts.update(works)
     return dict(sorted(counts.items(), key=lambda item: (item[0].kind, *item[0])))
 
 

@@ -170,7 +170,7 @@ def reject_other_folder(file: Path) -> None:
         )
 
 
-def missing_parent(folder: Path) -> Path | None:
+def find_missing_parent(folder: Path) -> Path | None:
     """Return the parent of an absolute folder outside of the home folder if it does not exist.
 
     With a mistyped path, a run would fill the disk of the system.
@@ -180,7 +180,7 @@ def missing_parent(folder: Path) -> Path | None:
 
 
 def _reject_missing_parent(config: Config, file: Path) -> None:
-    missing = missing_parent(config.folder)
+    missing = find_missing_parent(config.folder)
     if missing is not None:
         raise PipelineError(
             f"folder: {missing} does not exist",

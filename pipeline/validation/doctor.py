@@ -31,7 +31,7 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.origins import REINSTALL
 from pipeline.run import dropped, machine, plan_stage
-from pipeline.run.claim import missing_parent
+from pipeline.run.claim import find_missing_parent
 from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import outdated
 from pipeline.run.run import Run
@@ -98,14 +98,14 @@ def run(run: Run, *, tried: bool = False) -> list[str]:
     # of the others.
     left_mb = (max(0.0, mb - size_mb(run.path(folder))) for folder, mb in needed_mb(run.config).items())
     findings = check(run, max(sum(left_mb), RUN_MB) / 1e3)
-    if not _failed(findings):
+    if not _list_failed(findings):
         findings += _tried(run, tried)
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     console.print(_in_lines(findings, console.width))
-    return _failed(findings)
+    return _list_failed(findings)
 
 
-def _failed(findings: Iterable[Diagnosis]) -> list[str]:
+def _list_failed(findings: Iterable[Diagnosis]) -> list[str]:
     """List the names of failed checks."""
     return [finding.name for finding in findings if finding.status == "fail"]
 
@@ -323,7 +323,7 @@ def _has_pip() -> bool:
 
 
 def _disk(run: Run, need_gb: float) -> Diagnosis:
-    missing = missing_parent(run.config.folder)
+    missing = find_missing_parent(run.config.folder)
     if missing is not None:
         remedy = f"correct `folder:` in the configuration, or create {missing}"
         return Diagnosis("disk", "fail", f"{missing} does not exist", remedy)

@@ -69,7 +69,7 @@ def test_only_the_named_surfaces_change_and_all_comes_back(shown: Renderer, requ
             replaced = {shown.model.texture(i).name for i, now in enumerate(texture_bytes(shown)) if now != textures[i]}
             assert replaced == (THEMES[arena] if component == "theme" else {worked_on(shown)})
             assert worked_on(shown) in replaced
-            visible = perturbation.shown(TASKS[arena])
+            visible = perturbation.list_shown(TASKS[arena])
             assert len(visible) == len(replaced)
             parts = [(place, skin) for place in visible if (skin := skin_of(shown.model, place.part))]
             assert {shown.model.texture(skin.texture).name for _, skin in parts} == replaced
