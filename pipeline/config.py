@@ -152,10 +152,10 @@ class PlanConfig(Frozen):
         """Return the axes that the episodes called ``name`` sample from.
 
         Raises:
-            ValueError: as ``Axis.beside``.
+            ValueError: as ``Axis.restrict_for``.
         """
-        axes = axes_of(name)
-        return tuple(self.axes.configured()[axis].beside(axes) for axis in axes)
+        axes = [self.axes.configured()[axis] for axis in axes_of(name)]
+        return tuple(axis.restrict_for(axes) for axis in axes)
 
 
 class ReplayConfig(Frozen):

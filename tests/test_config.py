@@ -108,7 +108,7 @@ def test_every_field_is_described(model: type[BaseModel]) -> None:
                 "episodes": {"language+layout": 4},
             },
             ("plan",),
-            "with goal or layout, axes.language.components must contain distraction or paraphrase",
+            "with layout, axes.language.components must contain distraction or paraphrase",
         ),
         ({"camera": {"distance": {"distance_scale": [[[2, 1]]] * 5}}}, ("plan", "axes"), "with low <= high"),
         ({"camera": {"distance": {"distance_scale": [[[0, 1]]] * 5}}}, ("plan", "axes"), "a positive multiple"),

@@ -85,6 +85,8 @@ class Perturbation(Frozen):
         same: the property that two changes must share to be compared: the LIBERO task, its instruction or its initial
             scene. ``None`` if all changes can be compared.
         can_hide: true if it can hide the hand or the task's things from the agent view.
+        changes_objects: true if episodes show other objects than the scene of their task; a rewrite that describes the
+            target without its name would be ambiguous.
     """
 
     axis: str
@@ -98,6 +100,7 @@ class Perturbation(Frozen):
     clearance: ClassVar[float] = 0.0
     same: ClassVar[Same | None] = None
     can_hide: ClassVar[bool] = False
+    changes_objects: ClassVar[bool] = False
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the axis's test tasks, in their order, for an episode of ``task``.
@@ -249,7 +252,12 @@ class Axis(Frozen):
         """Sample one of ``levels`` with equal probability."""
         return pick(rng, self.levels)
 
-    def beside(self, axes: Collection[str]) -> Axis:
+    @classmethod
+    def changes_objects(cls) -> bool:
+        """Return whether an episode of the axis can show other objects than the scene of its task."""
+        return any(kind.changes_objects for kind in cls.draws)
+
+    def restrict_for(self, axes: Collection[Axis]) -> Axis:
         """Return the axis restricted for episodes that are perturbed on all of ``axes`` together.
 
         Raises:

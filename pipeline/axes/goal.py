@@ -132,6 +132,8 @@ class GoalPerturbation(PhysicsPerturbation):
     start: Annotated[int, Field(ge=0)]
     scene_sha256: str = Field(default="", exclude_if=lambda sha256: not sha256)
 
+    changes_objects: ClassVar[bool] = True
+
     def played(self, task: Task) -> Task:
         """Return ``task`` in the other scene."""
         return carried(task, find_task(task.suite, self.scene))

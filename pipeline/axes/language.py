@@ -36,9 +36,6 @@ from pipeline.types import Place, Task
 Bank = dict[str, dict[str, dict[Component, tuple[str, ...]]]]
 """Suite to task name to class to rewrites."""
 
-OTHER_OBJECTS = frozenset({"goal", "layout"})
-"""Axes whose scenes have other objects than the task's own scene."""
-
 BANK_FILE = Path(__file__).with_name("language_bank.yaml")
 LEVELS = (0.5, 0.6, 0.67, 0.72)
 """Distances to the original wording at which the levels 2 to 5 begin."""
@@ -109,7 +106,7 @@ class LanguageAxis(Axis):
             raise ValueError("there is no such file")
         return bank
 
-    def beside(self, axes: Collection[str]) -> LanguageAxis:
+    def restrict_for(self, axes: Collection[Axis]) -> LanguageAxis:
         """Return the axis, restricted to the classes ``NAMED`` if another axis puts other objects around the target.
 
         Names stay unambiguous then: no object of ``layout`` has a category of the scene, and ``goal`` carries a task
@@ -118,16 +115,16 @@ class LanguageAxis(Axis):
         Raises:
             ValueError: when none of ``components`` is left.
         """
-        components = self._components_beside(axes)
+        changing = [axis.name() for axis in axes if axis.changes_objects()]
+        components = self._select_components(other_objects=bool(changing))
         if not components:
             raise ValueError(
-                f"with {' or '.join(sorted(OTHER_OBJECTS))}, axes.language.components must contain {' or '.join(NAMED)}"
+                f"with {' and '.join(changing)}, axes.language.components must contain {' or '.join(NAMED)}"
             )
         return self.model_copy(update={"components": components})
 
-    def _components_beside(self, axes: Collection[str]) -> tuple[Component, ...]:
-        """Return the components to sample if episodes are perturbed on all of ``axes`` together."""
-        if OTHER_OBJECTS.isdisjoint(axes):
+    def _select_components(self, *, other_objects: bool) -> tuple[Component, ...]:
+        if not other_objects:
             return self.components
         return tuple(component for component in self.components if component in NAMED)
 
@@ -159,16 +156,20 @@ class LanguageAxis(Axis):
         rewrites = deal(task, self.components, self.levels, self.bank)
         return rewrites[place % len(rewrites)]
 
-    def wordings(self, task: Task, axes: Collection[str], test: TestSet) -> tuple[str, ...]:
-        """List the rewrites of a task, perturbed on ``axes`` together, that keep their clearance to test instructions.
+    def wordings(self, task: Task, test: TestSet, *, other_objects: bool = False) -> tuple[str, ...]:
+        """List the rewrites of a task that keep their clearance to test instructions.
 
         The result is empty if no bank has rewrites of the task.
+
+        Args:
+            other_objects: whether the episode shows other objects than the scene of ``task``; then only rewrites that
+                name the target remain.
 
         Raises:
             PipelineError: when one of the rewrites does not pass ``lint``.
         """
         texts = []
-        for rewrite in _dealt(task, self._components_beside(axes), self.levels, self.bank):
+        for rewrite in _dealt(task, self._select_components(other_objects=other_objects), self.levels, self.bank):
             if rewrite.nearest(test, task).distance >= rewrite.clearance:
                 texts.append(rewrite.text)
         return tuple(texts)

@@ -64,6 +64,7 @@ class LayoutPerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "infinite if no category is shared with a test task in the same scene, else 0"
     clearance: ClassVar[float] = 1.0
     can_hide: ClassVar[bool] = True
+    changes_objects: ClassVar[bool] = True
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """Return the scene with the objects added; see ``pipeline.scenes.placement.place``."""

@@ -165,9 +165,9 @@ def axes_for(name: str, config: Config) -> tuple[Axis, ...]:
     Raises:
         PipelineError: when an axis has nothing to sample together with the others.
     """
-    names = name.split("+")
+    axes = [configured(axis, config) for axis in name.split("+")]
     try:
-        return tuple(configured(axis, config).beside(names) for axis in names)
+        return tuple(axis.restrict_for(axes) for axis in axes)
     except ValueError as error:
         raise PipelineError(str(error), where="plan.axes", remedy="choose other axes") from error
 
@@ -283,7 +283,7 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     tiles = [Tile(Image.fromarray(stage.frames(["image"])[0]), f"clean twin: {demo.task.instruction}")]
     for name in AXES:
         axis = configured(name, config)
-        without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, [name], test)
+        without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, test)
         if axis.applies(demo.task) and not without_rewrites:
             drawn = variants(name, axis, demo, config.plan.seed, test)
             tiles.append(_typical(stage, drawn) if drawn else _nothing_drawn(name))

@@ -232,14 +232,14 @@ def wordings(axis: LanguageAxis | None, suite: str, task: str, perturbations: st
         perturbations: JSON list, as in the columns of the plan and the manifest.
     """
     changes = from_json(perturbations)
-    axes = tuple(change.axis for change in changes)
-    texts = _wordings(axis or LanguageAxis(), task_of(suite, task, perturbations), axes)
+    other_objects = any(change.changes_objects for change in changes)
+    texts = _wordings(axis or LanguageAxis(), task_of(suite, task, perturbations), other_objects=other_objects)
     return tuple(text for text in texts if not any(change.named_in(text) for change in changes))
 
 
 @cache
-def _wordings(axis: LanguageAxis, task: Task, axes: tuple[str, ...]) -> tuple[str, ...]:
-    return axis.wordings(task, axes, benchmark.load())
+def _wordings(axis: LanguageAxis, task: Task, *, other_objects: bool) -> tuple[str, ...]:
+    return axis.wordings(task, benchmark.load(), other_objects=other_objects)
 
 
 def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:

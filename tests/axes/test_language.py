@@ -13,8 +13,13 @@ from pydantic import ValidationError
 
 from pipeline import seeding
 from pipeline.axes.base import Level
+from pipeline.axes.goal import GoalAxis
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation, deal, distance, level_of, load_bank
 from pipeline.axes.language_lint import CLASSES, NAMED, lint, normalise
+from pipeline.axes.layout import LayoutAxis
+from pipeline.axes.noise import NoiseAxis
+from pipeline.axes.pose import PoseAxis
+from pipeline.axes.robot import RobotAxis
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.testset import benchmark
@@ -175,11 +180,14 @@ def test_no_classes_is_refused() -> None:
 
 
 def test_among_more_objects_things_are_called_by_their_names() -> None:
-    axis = LanguageAxis(levels=(1, 2)).beside(["layout", "language"])
-    assert axis == LanguageAxis(levels=(1, 2), components=NAMED)
-    assert LanguageAxis(components=("paraphrase", "common_sense")).beside(["layout"]).components == ("paraphrase",)
-    with pytest.raises(ValueError, match="distraction or paraphrase"):
-        LanguageAxis(components=("common_sense", "reasoning_chain")).beside(["layout"])
+    few_levels = LanguageAxis(levels=(1, 2))
+    for changing in (LayoutAxis(), GoalAxis()):
+        assert few_levels.restrict_for([changing, few_levels]) == LanguageAxis(levels=(1, 2), components=NAMED)
+    two = LanguageAxis(components=("paraphrase", "common_sense"))
+    assert two.restrict_for([LayoutAxis()]).components == ("paraphrase",)
+    assert two.restrict_for([NoiseAxis(), RobotAxis(), PoseAxis()]) == two
+    with pytest.raises(ValueError, match=r"with goal and layout, .* distraction or paraphrase"):
+        LanguageAxis(components=("common_sense", "reasoning_chain")).restrict_for([GoalAxis(), LayoutAxis()])
 
 
 def test_levels_follow_the_distance_to_the_original(task: Task) -> None:
@@ -273,20 +281,20 @@ def test_a_further_bank_joins_the_shipped_one(tmp_path: Path) -> None:
 def test_wordings_are_a_tasks_own_without_the_benchmarks(tmp_path: Path, test: TestSet) -> None:
     for known in TASKS:
         listed = {text for texts in load_bank()[known.suite][known.name].values() for text in texts}
-        assert set(LanguageAxis().wordings(known, ("clean",), test)) == listed
+        assert set(LanguageAxis().wordings(known, test)) == listed
         named = {text for one in NAMED for text in load_bank()[known.suite][known.name][one]}
-        assert set(LanguageAxis().wordings(known, ("layout", "noise"), test)) == named
+        assert set(LanguageAxis().wordings(known, test, other_objects=True)) == named
     known, bank = TASKS[0], tmp_path / "bank.yaml"
     texts = [str(tested.parameters["text"]) for tested in test.on(known, "language")]
     tested = next(text for text in texts if lint(text, known, "distraction") is None)
     bank.write_text(yaml.safe_dump({known.suite: {known.name: {"distraction": [tested]}}}))
     assert tested in {card.text for card in deal(known, bank=bank)}
-    assert {*LanguageAxis(bank=bank).wordings(known, (), test)} == {*LanguageAxis().wordings(known, (), test)}
+    assert {*LanguageAxis(bank=bank).wordings(known, test)} == {*LanguageAxis().wordings(known, test)}
 
 
 def test_a_task_without_rewrites_has_no_wordings(test: TestSet) -> None:
     known = find_task("libero_90", "KITCHEN_SCENE6_close_the_microwave")
-    assert LanguageAxis().wordings(known, (), test) == ()
+    assert LanguageAxis().wordings(known, test) == ()
 
 
 def test_of_a_wording_in_both_banks_and_two_classes_the_first_counts(tmp_path: Path) -> None:

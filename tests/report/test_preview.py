@@ -202,7 +202,7 @@ def test_a_combination_without_anything_left_is_an_error() -> None:
     descriptions = Axes(language=LanguageAxis(components=("common_sense",)))
     config = STARTER.model_copy(update={"plan": STARTER.plan.model_copy(update={"axes": descriptions})})
     with pytest.raises(
-        PipelineError, match=r"with goal or layout, axes\.language\.components must contain distraction or paraphrase"
+        PipelineError, match=r"with layout, axes\.language\.components must contain distraction or paraphrase"
     ):
         preview.axes_for("layout+language", config)
 
