@@ -38,10 +38,10 @@ class LensPerturbation(RenderPerturbation):
 class LensAxis(Axis):
     """Axis that narrows the view by up to 6 % at level 1 and up to 30 % at level 5."""
 
-    draws: ClassVar = (LensPerturbation,)
+    kinds: ClassVar = (LensPerturbation,)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LensPerturbation:
-        level = self.draw_level(rng)
+        level = self.sample_level(rng)
         return LensPerturbation(level=level, fovy_scale=round(1 - 0.06 * (level - rng.random()), 4))
 
 

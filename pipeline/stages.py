@@ -143,7 +143,7 @@ def check_leakage(run: Run) -> None:
     size_px = run.config.render.size_px
     if size_px != SIZE_PX:
         for name in findings:
-            if AXES[name].draws[0].layer is Layer.PIXELS:
+            if AXES[name].kinds[0].layer is Layer.PIXELS:
                 print(f"{name}: levels and distances are those of frames of {SIZE_PX} pixels, not of {size_px}")
     leakage.write(findings, run.path(LEAKAGE))
     Console().print(leakage.report(findings))

@@ -80,7 +80,7 @@ def _read_by(tag: str, kinds: Sequence[Any]) -> Any:
 
 
 _LIST: TypeAdapter[tuple[Perturbation, ...]] = TypeAdapter(
-    tuple[_read_by("axis", [_read_by("component", axis.draws) for axis in AXES.values()]), ...]  # type: ignore[misc, arg-type]
+    tuple[_read_by("axis", [_read_by("component", axis.kinds) for axis in AXES.values()]), ...]  # type: ignore[misc, arg-type]
 )
 
 Kind = TypeVar("Kind", bound=Perturbation)
@@ -125,7 +125,7 @@ def level_of_test(tested: TestTask) -> int:
 def components_of(axis: str) -> tuple[str, ...]:
     """List the values that the column ``component`` can have for an axis."""
     components: list[str] = []
-    for kind in AXES[axis].draws:
+    for kind in AXES[axis].kinds:
         components += get_args(kind.model_fields["component"].annotation)
     return tuple(components)
 

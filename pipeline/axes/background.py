@@ -183,7 +183,7 @@ class BackgroundAxis(Axis):
             At 0 a texture has the average colour of the replaced one. Perturbations in own colours ignore the field.
     """
 
-    draws: ClassVar = (BackgroundPerturbation,)
+    kinds: ClassVar = (BackgroundPerturbation,)
     colour: ClassVar = "#1f9e82"
     dimension: ClassVar = "background"
     test_scene: ClassVar = "scene files"
@@ -201,14 +201,14 @@ class BackgroundAxis(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
         component = pick(rng, self.components)
-        level = self.draw_level(rng)
+        level = self.sample_level(rng)
         own_colours = rng.random() < self.own_colours and 5 in self.levels
         if own_colours:
             level = 5
         return BackgroundPerturbation(
             component=component,
             level=level,
-            coverings=tuple(self._draw_covering(rng, part, own_colours) for part in PARTS[component]),
+            coverings=tuple(self._sample_covering(rng, part, own_colours) for part in PARTS[component]),
             colour_scale=1.0 if own_colours else self.colour_scale[level - 1],
         )
 
@@ -220,7 +220,7 @@ class BackgroundAxis(Axis):
             "procedural": sum(texture.source == "procedural" for texture in listed),
         }
 
-    def _draw_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
+    def _sample_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
         """Sample the texture of a part.
 
         Args:

@@ -178,7 +178,7 @@ class Axis(Frozen):
     """Ranges that an axis samples from.
 
     Attributes:
-        draws: classes of the perturbations that it samples; the field ``component`` discriminates between them.
+        kinds: classes of the perturbations that it samples; the field ``component`` discriminates between them.
         colour: colour of the axis in plots.
         dimension: the paper's dimension whose test tasks this axis has; empty if the benchmark tests no such change.
         test_name: the paper's name of these test tasks, if they are only a part of the dimension; else empty.
@@ -189,7 +189,7 @@ class Axis(Frozen):
         levels: Levels to sample, 1 (weak) to 5 (strong), each entry with equal probability; all five by default.
     """
 
-    draws: ClassVar[tuple[type[Perturbation], ...]]
+    kinds: ClassVar[tuple[type[Perturbation], ...]]
     colour: ClassVar[str] = "#a3384d"
     dimension: ClassVar[str] = ""
     test_name: ClassVar[str] = ""
@@ -248,7 +248,7 @@ class Axis(Frozen):
             PipelineError: naming component and level.
         """
 
-    def draw_level(self, rng: np.random.Generator) -> Level:
+    def sample_level(self, rng: np.random.Generator) -> Level:
         """Sample one of ``levels`` with equal probability."""
         return pick(rng, self.levels)
 
@@ -286,7 +286,7 @@ class Axis(Frozen):
     @classmethod
     def name(cls) -> str:
         """Return the name of the axis, which all its perturbations have."""
-        return str(cls.draws[0].model_fields["axis"].default)
+        return str(cls.kinds[0].model_fields["axis"].default)
 
     @classmethod
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -> CoveragePlots:
@@ -295,8 +295,8 @@ class Axis(Frozen):
         There is a plot of the level and one of each numeric parameter, unless an axis describes others.
         """
         parameters = []
-        for parameter, field in cls.draws[0].model_fields.items():
-            if field.annotation in (int, float) and all(parameter in kind.model_fields for kind in cls.draws):
+        for parameter, field in cls.kinds[0].model_fields.items():
+            if field.annotation in (int, float) and all(parameter in kind.model_fields for kind in cls.kinds):
                 parameters.append(parameter)
         plots: list[Plot] = []
         for parameter in ("level", *parameters):
@@ -448,7 +448,7 @@ ByLevel = tuple[T, T, T, T, T]
 Degrees = Annotated[float, Field(ge=-180.0, le=180.0)]
 
 
-def draw(rng: np.random.Generator, intervals: Intervals[float]) -> float:
+def sample_number(rng: np.random.Generator, intervals: Intervals[float]) -> float:
     """Sample one number, uniform over the union of ``intervals``, rounded to four decimals (as it is recorded).
 
     If all intervals are points, each has equal probability. A point next to longer intervals is never sampled.
@@ -469,7 +469,7 @@ def pick(rng: np.random.Generator, choices: Sequence[T]) -> T:
     return choices[int(rng.integers(len(choices)))]
 
 
-def point(rng: np.random.Generator, distance: float) -> tuple[float, float]:
-    """Sample a point (x, y) at ``distance`` from the origin, in any direction, rounded as in ``draw``."""
+def sample_point(rng: np.random.Generator, distance: float) -> tuple[float, float]:
+    """Sample a point (x, y) at ``distance`` from the origin, in any direction, rounded as in ``sample_number``."""
     bearing_rad = rng.uniform(-math.pi, math.pi)
     return round(distance * math.cos(bearing_rad), 4), round(distance * math.sin(bearing_rad), 4)

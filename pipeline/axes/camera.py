@@ -21,10 +21,10 @@ from pipeline.axes.base import (
     Intervals,
     Level,
     RenderPerturbation,
-    draw,
     level_from,
     pick,
-    point,
+    sample_number,
+    sample_point,
 )
 from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation, Scatter, Strips
 from pipeline.errors import PipelineError
@@ -261,18 +261,18 @@ class AsideRange(Frozen):
     distance_scale: Scales = ((0.87, 0.914), (1.094, 1.18))
     turn_deg: Angles = ((5.1, 8.0),)
 
-    def draw(self, rng: np.random.Generator, kind: Aside) -> dict[str, float]:
+    def sample(self, rng: np.random.Generator, kind: Aside) -> dict[str, float]:
         """Sample the parameters of one kind of second change."""
         match kind:
             case "elevation":
-                return {"elevation_deg": draw(rng, self.elevation_deg)}
+                return {"elevation_deg": sample_number(rng, self.elevation_deg)}
             case "distance":
-                return {"distance_scale": draw(rng, self.distance_scale)}
+                return {"distance_scale": sample_number(rng, self.distance_scale)}
             case "turn":
-                yaw_deg, pitch_deg = point(rng, draw(rng, self.turn_deg))
+                yaw_deg, pitch_deg = sample_point(rng, sample_number(rng, self.turn_deg))
                 return {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg}
             case "yaw":
-                return {"yaw_deg": draw(rng, self.turn_deg) * (1 if rng.random() < 0.5 else -1)}
+                return {"yaw_deg": sample_number(rng, self.turn_deg) * (1 if rng.random() < 0.5 else -1)}
 
 
 ASIDES: dict[Component, tuple[Aside, ...]] = {
@@ -320,7 +320,7 @@ class CameraAxis(Axis):
         aside: Ranges of the second change, limited to the ranges of its component.
     """
 
-    draws: ClassVar = (CameraPerturbation,)
+    kinds: ClassVar = (CameraPerturbation,)
     colour: ClassVar = "#4285f4"
     dimension: ClassVar = "camera"
     audited: ClassVar = "cameras"
@@ -390,23 +390,25 @@ class CameraAxis(Axis):
         """Return whether one of ``TRIED_CAMERAS`` of a component and level keeps its clearance."""
         random = seeding.rng("clear cameras", component, level)
         for _ in range(TRIED_CAMERAS):
-            perturbation = self._draw(random, component, level, task)
+            perturbation = self._sample_at(random, component, level, task)
             if perturbation.nearest(test, task).distance >= perturbation.clearance:
                 return True
         return False
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
         component = pick(rng, self.components)
-        return self._draw(rng, component, self.draw_level(rng), task)
+        return self._sample_at(rng, component, self.sample_level(rng), task)
 
-    def _draw(self, rng: np.random.Generator, component: Component, level: Level, task: Task) -> CameraPerturbation:
+    def _sample_at(
+        self, rng: np.random.Generator, component: Component, level: Level, task: Task
+    ) -> CameraPerturbation:
         """Sample a perturbation of a component at a level."""
-        drawn = self._draw_parameters(rng, component, level)
+        parameters = self._sample_parameters(rng, component, level)
         if self.clear_by == "second_change" and is_in_tested_scene(task):
-            drawn |= self._draw_second_change(rng, component)
-        return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
+            parameters |= self._sample_second_change(rng, component)
+        return CameraPerturbation.model_validate({"component": component, "level": level, **parameters})
 
-    def _draw_second_change(self, rng: np.random.Generator, component: Component) -> dict[str, float]:
+    def _sample_second_change(self, rng: np.random.Generator, component: Component) -> dict[str, float]:
         """Sample a second change within the configured ranges; empty if none is found.
 
         A camera without a second change rarely keeps its clearance, and is then sampled again.
@@ -417,7 +419,7 @@ class CameraAxis(Axis):
         kind = pick(rng, kinds)
         intervals = self._intervals(COMPONENT_OF[kind])
         for _ in range(SECOND_CHANGES):
-            change = self.aside.draw(rng, kind)
+            change = self.aside.sample(rng, kind)
             value = max(change.values(), key=abs)
             if any(low <= value <= high for low, high in intervals):
                 return change
@@ -433,17 +435,17 @@ class CameraAxis(Axis):
             case "orientation":
                 return tuple(chain(*self.orientation.turn_deg))
 
-    def _draw_parameters(self, rng: np.random.Generator, component: Component, level: Level) -> dict[str, float]:
+    def _sample_parameters(self, rng: np.random.Generator, component: Component, level: Level) -> dict[str, float]:
         """Sample the parameters that a component changes."""
         match component:
             case "distance":
-                return {"distance_scale": draw(rng, self.distance.distance_scale[level - 1])}
+                return {"distance_scale": sample_number(rng, self.distance.distance_scale[level - 1])}
             case "spherical":
-                azimuth_deg = draw(rng, self.spherical.azimuth_deg[level - 1])
-                return {"azimuth_deg": azimuth_deg, "elevation_deg": draw(rng, self.spherical.elevation_deg)}
+                azimuth_deg = sample_number(rng, self.spherical.azimuth_deg[level - 1])
+                return {"azimuth_deg": azimuth_deg, "elevation_deg": sample_number(rng, self.spherical.elevation_deg)}
             case "orientation":
                 large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
-                turn_deg = draw(rng, self.orientation.turn_deg[level - 1])
+                turn_deg = sample_number(rng, self.orientation.turn_deg[level - 1])
                 return {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
 
     @classmethod

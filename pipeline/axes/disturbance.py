@@ -120,7 +120,7 @@ class DisturbanceAxis(Axis):
             in the replay; 5 by default. At 0 the gripper may change directly before or after the push.
     """
 
-    draws: ClassVar = (DisturbancePerturbation,)
+    kinds: ClassVar = (DisturbancePerturbation,)
     colour: ClassVar = "#6b7d94"
 
     impulse_n_s: ByLevel[Annotated[float, Field(gt=0.0, le=100.0)]] = (4.0, 7.0, 10.0, 13.0, 16.0)
@@ -129,7 +129,7 @@ class DisturbanceAxis(Axis):
     away_steps: Steps = 5
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> DisturbancePerturbation:
-        level = self.draw_level(rng)
+        level = self.sample_level(rng)
         steps = _step(rng, self.steps)
         first_step = _step(rng, self.first_step)
         bearing_rad = rng.uniform(-math.pi, math.pi)

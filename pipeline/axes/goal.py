@@ -159,7 +159,7 @@ class GoalAxis(Axis):
             default.
     """
 
-    draws: ClassVar = (GoalPerturbation,)
+    kinds: ClassVar = (GoalPerturbation,)
     colour: ClassVar = "#8a5a9e"
     not_held_out: ClassVar = "held-out pairs of task and scene are run by --source goals"
 

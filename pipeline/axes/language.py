@@ -88,7 +88,7 @@ class LanguageAxis(Axis):
             default.
     """
 
-    draws: ClassVar = (LanguagePerturbation,)
+    kinds: ClassVar = (LanguagePerturbation,)
     colour: ClassVar = "#e4572e"
     dimension: ClassVar = "language"
     audited: ClassVar = "instructions"

@@ -132,7 +132,7 @@ class LayoutAxis(Axis):
             Each object has at most an equal share of it.
     """
 
-    draws: ClassVar = (LayoutPerturbation,)
+    kinds: ClassVar = (LayoutPerturbation,)
     colour: ClassVar = "#7d9a1f"
     dimension: ClassVar = "layout"
     test_name: ClassVar = "confounding objects"
@@ -147,7 +147,7 @@ class LayoutAxis(Axis):
         return int(tested.parameters["count"])
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LayoutPerturbation:
-        level = self.draw_level(rng)
+        level = self.sample_level(rng)
         fitting = _fitting(self.sources, task)
         shelf: dict[str, ObjectModel] = {}
         for index in rng.permutation(len(fitting)):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
-from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, Level, RenderPerturbation, Share, draw
+from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, Level, RenderPerturbation, Share, sample_number
 from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Strips
 from pipeline.libero import bddl
 from pipeline.testset.benchmark import TestSet
@@ -159,7 +159,7 @@ class LightAxis(Axis):
         ranges: Ranges of each level, weakest first.
     """
 
-    draws: ClassVar = (LightPerturbation,)
+    kinds: ClassVar = (LightPerturbation,)
     colour: ClassVar = "#e59a00"
     dimension: ClassVar = "light"
     test_scene: ClassVar = "scene files"
@@ -175,49 +175,52 @@ class LightAxis(Axis):
     )
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LightPerturbation:
-        component, level = self._draw_component(rng), self.draw_level(rng)
+        component, level = self._sample_component(rng), self.sample_level(rng)
         properties: dict[Component, tuple[Property, ...]] = {
             "shadows": ("shadows", "direction"),
             "combined": ("diffuse", "direction", "specular", *(("shadows",) if rng.random() < 0.5 else ())),
         }
-        drawn: dict[str, object] = {}
+        parameters: dict[str, object] = {}
         names = properties.get(component, (component,))
         # The kitchen's lamps and lamps with shadows already have their largest brightness.
         brightest = "shadows" in names or bddl.read(task.bddl_file).arena == "kitchen"
         for name in names:
-            drawn |= self._draw(rng, name, level, brightest)
-        return LightPerturbation.model_validate({"component": component, "level": level, **drawn})
+            parameters |= self._sample_property(rng, name, level, brightest)
+        return LightPerturbation.model_validate({"component": component, "level": level, **parameters})
 
-    def _draw_component(self, rng: np.random.Generator) -> Component:
+    def _sample_component(self, rng: np.random.Generator) -> Component:
         """Sample ``combined`` with probability ``combined_share``, else one of the other components."""
         single = [component for component in self.components if component != "combined"]
         if "combined" in self.components and (not single or rng.random() < self.combined_share):
             return "combined"
         return single[rng.integers(len(single))]
 
-    def _draw(self, rng: np.random.Generator, component: str, level: Level, brightest: bool) -> dict[str, object]:
+    def _sample_property(self, rng: np.random.Generator, name: str, level: Level, brightest: bool) -> dict[str, object]:
         """Sample the parameters of one property at a level.
 
         Args:
             brightest: true if the lamps must not become brighter.
         """
         ranges = self.ranges[level - 1]
-        match component:
+        match name:
             case "diffuse":
                 scales = ranges.brightness_scale
                 if brightest:
                     scales = tuple((low, min(high, 1.0)) for low, high in scales if low < 1)
                 # Not both: a brighter lamp drives its tint back to white.
                 if rng.random() < 0.5 and scales:
-                    return {"diffuse_scale_rgb": [draw(rng, scales)] * 3}
-                tint = colorsys.hsv_to_rgb(rng.random(), draw(rng, ranges.saturation), 1.0)
+                    return {"diffuse_scale_rgb": [sample_number(rng, scales)] * 3}
+                tint = colorsys.hsv_to_rgb(rng.random(), sample_number(rng, ranges.saturation), 1.0)
                 return {"diffuse_scale_rgb": [round(channel, 4) for channel in tint]}
             case "specular":
-                return {"specular_scale": draw(rng, ranges.specular_scale)}
+                return {"specular_scale": sample_number(rng, ranges.specular_scale)}
             case "direction":
-                return {"tilt_deg": draw(rng, ranges.tilt_deg), "tilt_azimuth_deg": draw(rng, TILT_AZIMUTH_DEG)}
+                return {
+                    "tilt_deg": sample_number(rng, ranges.tilt_deg),
+                    "tilt_azimuth_deg": sample_number(rng, TILT_AZIMUTH_DEG),
+                }
             case _:
-                return {"shadows": True, "fill_scale": draw(rng, ranges.fill_scale)}
+                return {"shadows": True, "fill_scale": sample_number(rng, ranges.fill_scale)}
 
     @classmethod
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[LightPerturbation]], test: TestSet) -> CoveragePlots:

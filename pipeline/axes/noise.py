@@ -144,7 +144,7 @@ class NoiseAxis(Axis):
         glass: Parameters of frosted glass at each level.
     """
 
-    draws: ClassVar = (NoisePerturbation,)
+    kinds: ClassVar = (NoisePerturbation,)
     colour: ClassVar = "#9467d6"
     dimension: ClassVar = "noise"
 
@@ -169,7 +169,7 @@ class NoiseAxis(Axis):
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
         """Sample a component and a level, each with equal probability, independent of ``task`` and ``place``."""
         grid = self._grids[pick(rng, self.components)]
-        level = self.draw_level(rng)
+        level = self.sample_level(rng)
         effect = grid[level - 1]
         seed = int(rng.integers(2**53))  # every JSON reader keeps such an integer exactly
         return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=seed)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from pipeline.axes.base import LEVELS, Axis, Frozen, Level, Perturbation, PhysicsPerturbation, Share, pick, point
+from pipeline.axes.base import LEVELS, Axis, Frozen, Level, Perturbation, PhysicsPerturbation, Share, pick, sample_point
 from pipeline.axes.report_data import (
     BENCHMARK,
     CoveragePlots,
@@ -63,7 +63,7 @@ APART, CLOSE_M = 0.75, 0.15
 FIXTURE_APART, FIXTURE_CLOSE_M = 0.9, 0.25
 """``APART`` and ``CLOSE_M`` for pairs with a fixture, which is larger."""
 
-DRAWS = 200
+MOST_ATTEMPTS = 200
 """Most attempts to sample a scene that keeps its relations; the last scene is then left to be rejected."""
 
 
@@ -299,7 +299,7 @@ def sample_scene(rng: np.random.Generator, level: Level, task: Task, places_m: S
     definition = definition_of(task)
     carriers, centres_m = definition.carriers, definition.centres_m
     radius_m = level * _disk_m(task)
-    for _ in range(DRAWS):
+    for _ in range(MOST_ATTEMPTS):
         shifts = {}
         for carrier in dict.fromkeys(carriers.values()):
             reach_m = radius_m * math.sqrt(rng.uniform())
@@ -383,7 +383,7 @@ class PoseAxis(Axis):
         turn_deg: Largest turn of an object to either side at every level, in degrees, not for ``scene``; 20 by default.
     """
 
-    draws: ClassVar = (PosePerturbation, ScenePerturbation)
+    kinds: ClassVar = (PosePerturbation, ScenePerturbation)
     colour: ClassVar = "#d463b0"
     dimension: ClassVar = "layout"
     test_name: ClassVar = "displaced targets"
@@ -426,10 +426,10 @@ class PoseAxis(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
         component, moved = pick(rng, self._choices(task))
-        level = self.draw_level(rng)
+        level = self.sample_level(rng)
         if component == "scene":
             return self._sample_moved_scene(rng, level, task)
-        dx_m, dy_m = point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
+        dx_m, dy_m = sample_point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
         turn_deg = round(rng.uniform(-self.turn_deg, self.turn_deg), 2)
         return PosePerturbation(level=level, component=component, moved=moved, dx_m=dx_m, dy_m=dy_m, dyaw_deg=turn_deg)
 

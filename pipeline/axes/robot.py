@@ -162,7 +162,7 @@ class RobotAxis(Axis):
             half of them start further away.
     """
 
-    draws: ClassVar = (RobotPerturbation,)
+    kinds: ClassVar = (RobotPerturbation,)
     colour: ClassVar = "#129fc0"
     dimension: ClassVar = "robot"
 
@@ -179,7 +179,7 @@ class RobotAxis(Axis):
         return level_from(float(tested.parameters["id"]) / 100)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
-        level = self.draw_level(rng)
+        level = self.sample_level(rng)
         component = pick(rng, self.components)
         direction = rng.standard_normal(7)
         norms_rad = self.initial_norm_rad if component == "initial_joints" else self.norm_rad

@@ -45,7 +45,7 @@ def axes() -> None:
     names_of_views = {frozenset(ALL_VIEWS): "all", frozenset({"image"}): "agent view", frozenset[str](): "none"}
     table = Table("axis", "components", "generated again", "changed views", box=None, pad_edge=False)
     for axis in AXES:
-        kind = AXES[axis].draws[0]
+        kind = AXES[axis].kinds[0]
         components = ", ".join(components_of(axis))
         views = names_of_views.get(kind.views) or ", ".join(sorted(kind.views))
         table.add_row(axis, components, kind.layer.name.lower(), views)

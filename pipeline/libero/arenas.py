@@ -25,7 +25,7 @@ class Region(NamedTuple):
     x_m: tuple[float, float]
     y_m: tuple[float, float]
 
-    def draw(self, rng: np.random.Generator) -> Floats:
+    def sample(self, rng: np.random.Generator) -> Floats:
         """Sample a place (2,) in the region."""
         return np.array([rng.uniform(*self.x_m), rng.uniform(*self.y_m)])
 

@@ -116,13 +116,13 @@ def check(rows: Sequence[Row | Compared], test: TestSet) -> dict[str, AxisDistan
     return findings
 
 
-def distances(axis: str, draws: Iterable[tuple[Perturbation, Task]], test: TestSet) -> Floats:
+def distances(axis: str, perturbed: Iterable[tuple[Perturbation, Task]], test: TestSet) -> Floats:
     """Return the distance (N,) from each of an axis's test tasks to the nearest of some perturbations on the axis.
 
     It is NaN if the test task cannot be compared with any of them, or if the axis's measure has no unit.
     """
     least = np.full(len(test.on_axis(axis)), np.nan)
-    for perturbation, task in draws:
+    for perturbation, task in perturbed:
         if perturbation.unit is not None:
             np.fmin(least, perturbation.distances(test, task), out=least)
     return least
@@ -149,14 +149,14 @@ def covered_by(
         kept: rows of the manifest.
         findings: content of ``leakage.json``.
     """
-    draws: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
+    perturbed: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
     for row in kept:
         for perturbation in from_json(row["perturbations"]):
             task = task_of(row["suite"], row["task"], row["perturbations"])
-            draws[perturbation.axis].append((perturbation, task))
+            perturbed[perturbation.axis].append((perturbation, task))
     covered = {}
     for axis, finding in findings.items():
-        components = coverage(axis, distances(axis, draws[axis], test), test)
+        components = coverage(axis, distances(axis, perturbed[axis], test), test)
         figures = {name: asdict(figures_of_component) for name, figures_of_component in components.items()}
         covered[axis] = {**finding, "coverage": figures}
     return covered

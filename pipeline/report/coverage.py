@@ -28,7 +28,7 @@ def plot_axis(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -
     """Plot the coverage of one axis by its perturbations of kept episodes."""
     note, plots = AXES[axis].describe_coverage(kept, test)
     panels = [figures.plot(plot) for plot in plots]
-    unit = AXES[axis].draws[0].unit
+    unit = AXES[axis].kinds[0].unit
     if unit is not None and test.on_axis(axis):
         panels.append(_distances(axis, kept, test, unit))
     return AxisPlots(note, panels)

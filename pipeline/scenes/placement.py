@@ -22,9 +22,9 @@ from pipeline.scenes.swept_path import SweptPath
 from pipeline.types import Demo, Floats, RollOut, Scene, State
 
 _BODY = "layout"
-SCENES, DRAWS = 12, 60
+MOST_SCENES, MOST_PLACES = 12, 60
 """Number of attempts before giving up: whole scenes, and places of one object in either region."""
-DRAW_CLEARANCE_M, CLEARANCE_M = 0.02, 0.015
+SAMPLED_CLEARANCE_M, CLEARANCE_M = 0.02, 0.015
 """Least distance of an object from the demonstration's path: at the sampled place, and after it has come to rest."""
 HIDDEN = 1 / 3
 """Largest share of a thing of the task, as the first frame shows it, that added objects may cover.
@@ -61,8 +61,8 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
     """
     placement = _Placement(scene, roll_out(scene, demo), objects, definition_of(demo.task))
     rejected: Counter[str] = Counter()
-    for attempt in range(SCENES):
-        poses = placement.draw(seeding.rng(seed, "layout", attempt), rejected)
+    for attempt in range(MOST_SCENES):
+        poses = placement.sample(seeding.rng(seed, "layout", attempt), rejected)
         if poses is None:
             continue
         settled, fault = placement.settle(poses)
@@ -144,7 +144,7 @@ class _Placement:
         time, qpos, qvel = State.of(state, self._old_nq)
         return State(time, np.append(qpos, poses), np.append(qvel, np.zeros(6 * len(poses)))).flat
 
-    def draw(self, rng: np.random.Generator, rejected: Counter[str]) -> Floats | None:
+    def sample(self, rng: np.random.Generator, rejected: Counter[str]) -> Floats | None:
         """Sample a pose for each object, the broadest object first.
 
         Args:
@@ -158,8 +158,8 @@ class _Placement:
         broadest_first = sorted(range(len(poses)), key=lambda number: -self._objects[number].shape.footprint_m2)
         for number in broadest_first:
             first, second = self._regions.order(rng)
-            for region in [first] * DRAWS + [second] * DRAWS:
-                fault = self._fault_at(poses, number, region.draw(rng), rng.uniform(-np.pi, np.pi))
+            for region in [first] * MOST_PLACES + [second] * MOST_PLACES:
+                fault = self._fault_at(poses, number, region.sample(rng), rng.uniform(-np.pi, np.pi))
                 if fault is None:
                     break
                 rejected[fault] += 1
@@ -183,7 +183,7 @@ class _Placement:
         if not self._view.holds(poses[number, :3] + [0, 0, half[2]]):
             # The object's middle must be in view: the border of the frame then cuts off at most about half of it.
             fault = "out_of_view"
-        elif not self._swept.clear(poses, DRAW_CLEARANCE_M):
+        elif not self._swept.clear(poses, SAMPLED_CLEARANCE_M):
             fault = "in_the_way"
         elif self.seen_px(poses)[number] < PLACED_PX:
             fault = "not_seen"

@@ -214,7 +214,7 @@ class Amounts(NamedTuple):
 def _planned(plan: PlanConfig) -> Iterator[tuple[int, list[type[Perturbation]]]]:
     """Yield, for each combination of axes, its wanted number of episodes, and the classes of its perturbations."""
     for name, episodes in plan.episodes.items():
-        yield episodes, [AXES[axis].draws[0] for axis in axes_of(name)]
+        yield episodes, [AXES[axis].kinds[0] for axis in axes_of(name)]
 
 
 def _changed_views(kinds: Iterable[type[Perturbation]], views: Iterable[str]) -> int:

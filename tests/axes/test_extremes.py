@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from pipeline.axes import AXES, Axes, Axis, Perturbation, PixelPerturbation, RenderPerturbation, from_json, to_json
 from pipeline.axes.background import BackgroundPerturbation
-from pipeline.axes.base import draw
+from pipeline.axes.base import sample_number
 from pipeline.axes.pose import PoseAxis
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import SUITES, tasks
@@ -130,10 +130,10 @@ def test_what_is_accepted_is_drawn_recorded_and_applied(name: str) -> None:
 
 def test_of_points_alone_each_comes() -> None:
     """No length of theirs says how often."""
-    drawn = [draw(rng("points", number), ((-30.0, -30.0), (10.0, 10.0))) for number in range(100)]
+    drawn = [sample_number(rng("points", number), ((-30.0, -30.0), (10.0, 10.0))) for number in range(100)]
     assert 30 < drawn.count(-30.0) < 70
     assert set(drawn) == {-30.0, 10.0}
-    assert draw(rng("point"), ((5.0, 5.0),)) == 5.0
+    assert sample_number(rng("point"), ((5.0, 5.0),)) == 5.0
 
 
 def recorded(drawn: Perturbation, task: Task) -> str:

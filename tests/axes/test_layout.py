@@ -134,7 +134,7 @@ def test_places_are_on_the_cameras_side_as_often_as_the_test_s(arena: Arena) -> 
     for key in range(1000):
         keyed = seeding.rng("side", arena, key)
         first, _ = ARENAS[arena].regions.order(keyed)
-        drawn.append(first.draw(keyed)[0])
+        drawn.append(first.sample(keyed)[0])
     assert np.mean(np.array(drawn) > 0.19) == pytest.approx(np.mean(np.array(tested) > 0.19), abs=0.13)
 
 

@@ -96,7 +96,7 @@ class Drawn(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> Any:
         component = ("lamp", "window")[rng.integers(2)]
-        return self.kind.model_validate({"component": component, "level": self.draw_level(rng)})
+        return self.kind.model_validate({"component": component, "level": self.sample_level(rng)})
 
 
 def tiles(sheet: Image.Image, views: int) -> list[Frame]:
