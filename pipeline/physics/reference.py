@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
@@ -106,13 +106,23 @@ def _renamed(by_name: Mapping[str, T], names: Mapping[str, str]) -> dict[str, T]
     return {names[name]: value for name, value in by_name.items() if name in names}
 
 
+class _Contacts(NamedTuple):
+    """Fields of a ``Reference`` that come from contacts, in their order."""
+
+    busy: Mask
+    engaged: Mask
+    held: Mapping[str, Mask]
+    carried: Mapping[str, Mask]
+    met: Mapping[str, Mask]
+
+
 def _contacts(
     model: mujoco.MjModel,
     partners: Sequence[Mapping[int, set[int]]],
     poses: Mapping[str, Floats],
     places: Mapping[str, Floats],
-) -> tuple[Mask, Mask, Mapping[str, Mask], Mapping[str, Mask], Mapping[str, Mask]]:
-    """Return ``Reference``'s ``busy``, ``engaged``, ``held``, ``carried`` and ``met``.
+) -> _Contacts:
+    """Find the contacts of the hand and of the objects in it.
 
     Args:
         model: the scene's model.
@@ -161,7 +171,7 @@ def _contacts(
                     away_m = np.abs(poses[name][step, :2] - places[region][:2])
                     if (away_m < model.site(region).size[:2]).all():
                         met[region][last_held[body]] = True
-    return busy, engaged, held, carried, met
+    return _Contacts(busy, engaged, held, carried, met)
 
 
 def _roots(model: mujoco.MjModel) -> set[str]:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,45 +53,56 @@ def replay(
         scene, rejected = _apply_perturbations(environment, demo, replay_config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
-        scene = Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)})
-        none, alpha = np.empty((0, 7)), np.empty((1, 0), np.float32)
-        dropped = Verdict(False, error.reason)
-        return Trajectory(trajectory_id, "open_loop", scene, demo.init_state[None], none, alpha, dropped)
+        return Trajectory(
+            trajectory_id,
+            mode="open_loop",
+            scene=Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)}),
+            states=demo.init_state[None],
+            actions=np.empty((0, 7)),
+            site_alpha=np.empty((1, 0), np.float32),
+            verdict=Verdict(False, error.reason),
+        )
 
     if rejected:
         mode = "tracked" if replay_config.mode == "tracked" and reference() is not None else "open_loop"
         # The first state alone is stored.
-        states, actions, alphas, _ = _execute(environment, scene, 0, lambda: iter(()))
-        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, rejected)
+        executed = _execute(environment, scene, 0, lambda: iter(()))
+        return Trajectory(trajectory_id, mode, scene, *executed._replace(verdict=rejected))
 
-    def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
-        states, actions, alphas, judged = _execute(environment, scene, replay_config.settle_steps, policy)
-        fault = _fault_of(perturbations, actions) if judged.kept else None
+    def replay_by(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
+        executed = _execute(environment, scene, replay_config.settle_steps, policy)
+        fault = _fault_of(perturbations, executed.actions) if executed.verdict.kept else None
         if fault is not None:
-            judged = Verdict(False, fault)
-        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, judged)
+            executed = executed._replace(verdict=Verdict(False, fault))
+        return Trajectory(trajectory_id, mode, scene, *executed)
 
     # Recorded actions do not work against a push, so mode ``auto`` tracks pushed scenes even if they reach the goal.
     tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and scene.push is not None)
     followed = reference() if tracks else None
     if followed is None:
-        open_loop = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, replay_config.noops)]))
+        recorded = demo.actions[kept_actions(demo.actions, replay_config.noops)]
+        open_loop = replay_by("open_loop", lambda: iter(recorded))
         if replay_config.mode != "auto" or open_loop.verdict.kept:
             return open_loop
         followed = reference()
         if followed is None:
             return open_loop
-    return rollout("tracked", lambda: _tracking(environment, followed))
+    return replay_by("tracked", lambda: _tracking(environment, followed))
+
+
+class _Executed(NamedTuple):
+    """Fields of a ``Trajectory`` that come from the simulation, in their order."""
+
+    states: Floats
+    actions: Floats
+    site_alpha: NDArray[np.float32]
+    verdict: Verdict
 
 
 def _execute(
     environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
-) -> tuple[Floats, Floats, NDArray[np.float32], Verdict]:
-    """Let a scene settle, and then execute the actions that ``policy`` yields.
-
-    Returns:
-        States, actions, opacity of sites and verdict, as in ``Trajectory``.
-    """
+) -> _Executed:
+    """Let a scene settle, and then execute the actions that ``policy`` yields."""
     environment.restore(scene)
     # If the scene does not settle, store only the initial state.
     states, alphas = [environment.state], [environment.site_alpha]
@@ -108,7 +120,7 @@ def _execute(
     except RejectedError as error:
         rejected = Verdict(False, error.reason)
     judged = rejected or verdict(np.stack(states), np.array(succeeded, bool))
-    return np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged
+    return _Executed(np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged)
 
 
 def _fault_of(perturbations: Sequence[PhysicsPerturbation], actions: Floats) -> str | None:

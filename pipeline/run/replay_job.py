@@ -73,22 +73,22 @@ class ReplayJob:
 
     def _reference(self, demo: Demo, task: Task) -> Reference | None:
         """Return the reference that tracking follows in the scene of ``task``."""
-        reference = self._motion(demo)
+        reference = self._reference_in_own_scene(demo)
         if reference is None or task.goal_file is None:
             return reference
         return reference.in_scene(all_counterparts(task))
 
-    def _motion(self, demo: Demo) -> Reference | None:
-        """Return the motion of the clean twin if it reached its goal, else of the recording."""
+    def _reference_in_own_scene(self, demo: Demo) -> Reference | None:
+        """Return the reference of the clean twin if it reached its goal, else of the recording."""
         if self.twin != self.row.trajectory_id:
             twin = TrajectoryStore(self.folder).path(self.twin)
-            reference = _twin(edition(twin))
+            reference = _reference_of_file(edition(twin))
             if reference is not None:
                 return reference
         if demo.states is None:
             # Replay the recorded hand motion, which began before anything settled.
             unsettled = self.replay_config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
-            return _followed(replay(shared(demo.task), demo, self.row.trajectory_id, unsettled))
+            return _reference_of(replay(shared(demo.task), demo, self.row.trajectory_id, unsettled))
         mask = kept_actions(demo.actions, self.replay_config.noops)
         # The state after the last action is not recorded: assume that the hand rests.
         states = np.vstack([demo.states[mask], demo.states[-1:]])
@@ -115,13 +115,13 @@ class ReplayJob:
 
 
 @lru_cache(maxsize=1)
-def _twin(file: Edition) -> Reference | None:
-    """Return the motion of a clean twin, `None` if it did not reach its goal."""
-    return _followed(TrajectoryStore(file.path.parent).load(file.path.stem))
+def _reference_of_file(file: Edition) -> Reference | None:
+    """Read the reference of a clean twin from its trajectory's file, `None` if it did not reach its goal."""
+    return _reference_of(TrajectoryStore(file.path.parent).load(file.path.stem))
 
 
-def _followed(trajectory: Trajectory) -> Reference | None:
-    """Return the motion of a replay, `None` if it did not reach its goal."""
+def _reference_of(trajectory: Trajectory) -> Reference | None:
+    """Return the reference of a replay, `None` if it did not reach its goal."""
     if not trajectory.verdict.kept:
         return None
     return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
