@@ -20,7 +20,7 @@ import numpy as np
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Format
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.machine_code import ensure_fixed_machine_code
@@ -94,7 +94,7 @@ def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, f
 
             def write(ids: Sequence[str]) -> int:
                 """Write the dataset; return its bytes."""
-                facts = Known("libero_spatial", "synthetic", "", load(ids[0]).instruction, steps)
+                facts = EpisodeFacts("libero_spatial", "synthetic", "", load(ids[0]).instruction, steps)
                 export(target, Episodes(dict.fromkeys(ids, facts), load), run)
                 return sum((target.folder / file).stat().st_size for file in target.record().files)
 

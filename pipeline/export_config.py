@@ -12,7 +12,7 @@ from pipeline.axes import axes_of
 from pipeline.axes.component_names import ComponentName
 from pipeline.episode_schema import STANDARD, Content
 from pipeline.formats.base import Format, FormatOptions, Options
-from pipeline.formats.episodes import too_few, validating
+from pipeline.formats.episodes import count_for_validation, too_few
 from pipeline.formats.registry import FORMATS
 from pipeline.types import Frozen
 
@@ -154,5 +154,5 @@ class ExportConfig(_Formats):
         for dataset in self.datasets(Path()):
             least = min if dataset.splits_each_suite else max
             share = dataset.options.validation
-            if share and not validating(share, least(written, default=0)):
+            if share and not count_for_validation(share, least(written, default=0)):
                 raise too_few(share, f"export.{dataset.name}.validation")

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA, Content
 from pipeline.formats.base import Format
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.hdf5 import Hdf5, Hdf5Config
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
@@ -141,10 +141,10 @@ def files(folder: Path) -> Tree:
 
 
 def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -> Episodes:
-    facts: dict[str, Known] = {}
+    facts: dict[str, EpisodeFacts] = {}
     for episode_id in IDS:
         source = episode(episode_id)
-        facts[episode_id] = Known("libero_spatial", content, DEMO, source.instruction, len(source))
+        facts[episode_id] = EpisodeFacts("libero_spatial", content, DEMO, source.instruction, len(source))
     return Episodes(facts, load)
 
 

@@ -74,7 +74,7 @@ Options = TypeVar("Options", bound=FormatOptions)
 
 
 @dataclass(frozen=True)
-class Export(Record):
+class DatasetRecord(Record):
     """The record of a finished dataset, in ``data/<run>/<format>.json``.
 
     Attributes:
@@ -86,7 +86,7 @@ class Export(Record):
     sizes: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Export":
+    def from_json(cls, content: Mapping[str, Any]) -> "DatasetRecord":
         """Return the record that ``to_json`` wrote, in this version or an earlier one.
 
         Raises:
@@ -209,14 +209,14 @@ class Format(ABC, Generic[Options]):
         """Return the folder of unfinished files, on the file system of ``folder``, so that finishing only renames."""
         return self.data / ".work" / self.name
 
-    def record(self) -> Export:
+    def record(self) -> DatasetRecord:
         """Read the record of the finished dataset.
 
         Raises:
             PipelineError: when the record is missing or unreadable.
         """
         try:
-            return Export.from_json(json.loads(self.record_file.read_text()))
+            return DatasetRecord.from_json(json.loads(self.record_file.read_text()))
         except (OSError, LookupError, TypeError, ValueError) as error:
             raise PipelineError(
                 f"there is no finished dataset ({error})", where=self.record_file, remedy=MAKE_AGAIN

@@ -12,14 +12,14 @@ from pipeline.seeding import digest
 from pipeline.types import Episode
 
 
-def validating(share: float, demonstrations: int) -> int:
+def count_for_validation(share: float, demonstrations: int) -> int:
     """Return the number of a task's demonstrations in ``val``: rounded half to even, and 0 for a single one."""
     return round(share * demonstrations) if demonstrations > 1 else 0
 
 
 def too_few(share: float, where: str) -> PipelineError:
     """Return the error that no task, in total or in a suite, has enough demonstrations for a share above 0."""
-    least = next(number for number in count(max(2, int(0.5 / share))) if validating(share, number))
+    least = next(number for number in count(max(2, int(0.5 / share))) if count_for_validation(share, number))
     return PipelineError(
         f"no task has enough demonstrations for {share:g} of them to go into the split val",
         where=where,
@@ -54,8 +54,8 @@ class Piece:
     tasks: Mapping[str, int] = field(default_factory=dict)
 
 
-class Known(NamedTuple):
-    """Facts about an episode that are available before it is loaded.
+class EpisodeFacts(NamedTuple):
+    """Facts about an episode that are known before it is loaded; they decide its place in a dataset.
 
     Attributes:
         content: fingerprint that changes with anything that ``load`` would return.
@@ -85,16 +85,16 @@ class Episodes:
     """Content of a dataset.
 
     Attributes:
-        known: episode id to the facts about the episode, in the order of writing. The order is shuffled, because
+        facts: episode id to the facts about the episode, in the order of writing. The order is shuffled, because
             readers read a dataset in order.
     """
 
-    known: Mapping[str, Known]
+    facts: Mapping[str, EpisodeFacts]
     load: Load
 
     @property
     def ids(self) -> list[str]:
-        return list(self.known)
+        return list(self.facts)
 
     def by_split(self, validation: float) -> dict[str, list[str]]:
         """Divide the episodes into ``train`` and, with a validation share above 0, ``val``, in the order of ``ids``.
@@ -109,7 +109,7 @@ class Episodes:
         Raises:
             PipelineError: when there are no episodes, or the demonstrations are too few for a validation split.
         """
-        if not self.known:
+        if not self.facts:
             raise PipelineError(
                 "there are no episodes to write",
                 expected="1 or more",
@@ -117,34 +117,34 @@ class Episodes:
             )
         if not validation:
             return {"train": self.ids}
-        chosen = demos_for_validation(self.known.values(), validation)
+        chosen = demos_for_validation(self.facts.values(), validation)
         if not chosen:
             raise too_few(validation, "export.<format>.validation")
         splits: dict[str, list[str]] = {"train": [], "val": []}
-        for episode_id, facts in self.known.items():
+        for episode_id, facts in self.facts.items():
             splits["val" if facts.demo in chosen else "train"].append(episode_id)
         return splits
 
 
-def demos_for_validation(known: Iterable[Known], share: float) -> set[str]:
+def demos_for_validation(episodes: Iterable[EpisodeFacts], share: float) -> set[str]:
     """Choose the demonstrations of the split ``val``: all those of the given share of each task's origins."""
     demos_of_task: dict[str, dict[str, set[str]]] = {}
-    for facts in known:
+    for facts in episodes:
         task = facts.demo.rpartition("/")[0]
         demos_of_task.setdefault(task, {}).setdefault(facts.origin or facts.demo, set()).add(facts.demo)
     chosen: set[str] = set()
     for demos_of_origin in demos_of_task.values():
         origins = sorted(demos_of_origin.values(), key=lambda demos: min(digest("validation", demo) for demo in demos))
-        chosen.update(*origins[: validating(share, len(origins))])
+        chosen.update(*origins[: count_for_validation(share, len(origins))])
     return chosen
 
 
-def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:
+def number_pieces(slices: Mapping[str, tuple[str, Sequence[str]]], facts: Mapping[str, EpisodeFacts]) -> list[Piece]:
     """Return the pieces of one dataset, with the numbers of preceding episodes and steps that their files state.
 
     Args:
         slices: path of each piece, in order, to its split and its episodes.
-        known: episode id to the facts about the episode.
+        facts: episode id to the facts about the episode.
     """
     pieces: list[Piece] = []
     tasks: dict[str, int] = {}
@@ -152,7 +152,7 @@ def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str
         before = pieces[-1] if pieces else Piece("", ())
         numbers: dict[str, int] = {}
         for episode_id in ids:
-            text = known[episode_id].instruction
+            text = facts[episode_id].instruction
             numbers[text] = tasks.setdefault(text, len(tasks))
         piece = Piece(
             path,
@@ -161,7 +161,7 @@ def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str
             number=len(pieces),
             first_episode=before.first_episode + len(before.ids),
             first_step=before.first_step + before.steps,
-            steps=sum(known[episode_id].steps for episode_id in ids),
+            steps=sum(facts[episode_id].steps for episode_id in ids),
             tasks=numbers,
         )
         pieces.append(piece)

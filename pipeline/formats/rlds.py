@@ -73,12 +73,12 @@ class Rlds(Format[RldsConfig]):
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
-        steps = sum(facts.steps for facts in episodes.known.values())
+        steps = sum(facts.steps for facts in episodes.facts.values())
         shards = self.options.shards or ceil(steps / self._shard_steps())
         for split_name, members in episodes.by_split(self.options.validation).items():
-            suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
+            suites = {episode_id: episodes.facts[episode_id].suite for episode_id in members}
             for name, ids in by_suite(suites, self.options.name).items():
-                slices = split(ids, max(1, round(shards * len(ids) / len(episodes.known))))
+                slices = split(ids, max(1, round(shards * len(ids) / len(episodes.facts))))
                 for shard, slice_ids in enumerate(slices):
                     path = shard_path(name, split_name, shard, len(slices))
                     pieces.append(Piece(f"dataset/{path}", slice_ids, split_name))

@@ -20,7 +20,7 @@ from pipeline.clients.files import RECIPE
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum, read_json, schema_file
 from pipeline.formats.base import Format
-from pipeline.formats.episodes import Known, demos_for_validation
+from pipeline.formats.episodes import EpisodeFacts, demos_for_validation
 from pipeline.generated import generated
 from pipeline.libero.tasks import SUITES
 from pipeline.planning import leakage
@@ -134,7 +134,7 @@ def render(
     free = all(map(FREE.fullmatch, licences)) and not (own_suites or own_rewrites)
     axes = _axes(kept, shown)
     demos = {row["demo_id"] for row in kept}
-    known = [Known(row["suite"], demo=row["demo_id"], origin=row["demo_origin_sha256"]) for row in kept]
+    facts = [EpisodeFacts(row["suite"], demo=row["demo_id"], origin=row["demo_origin_sha256"]) for row in kept]
     return TEMPLATES.get_template("card.md.j2").render(
         line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
         shown=shown,
@@ -143,7 +143,7 @@ def render(
         metadata=_metadata(shown, name, publish, free=free, libero=libero).to_yaml(),
         publish=publish,
         demos=demos,
-        held_out=demos_for_validation(known, shown.options.validation),
+        held_out=demos_for_validation(facts, shown.options.validation),
         others=" and ".join(others),
         name=name,
         kept=kept,

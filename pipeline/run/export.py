@@ -32,8 +32,8 @@ from pipeline.files import (
     sync,
     write_json,
 )
-from pipeline.formats.base import Export, Format
-from pipeline.formats.episodes import Episodes, Known, Load, Piece
+from pipeline.formats.base import DatasetRecord, Format
+from pipeline.formats.episodes import EpisodeFacts, Episodes, Load, Piece
 from pipeline.identity import ALLOW, REMAKE, reject_unasked
 from pipeline.record import Basis
 from pipeline.run.layout import DATASETS, WORK
@@ -116,7 +116,7 @@ def _recorded(target: AnyFormat) -> set[str]:
     """
     recorded: set[str] = set()
     for file in target.work.glob(f"*/{FINISHED}"):
-        recorded |= Export.from_json(read_json(file)).files.keys()
+        recorded |= DatasetRecord.from_json(read_json(file)).files.keys()
     with suppress(PipelineError):  # The dataset has no record, or has changed since.
         recorded |= target.record().files.keys()
     return recorded
@@ -141,7 +141,7 @@ def reject_changed(target: AnyFormat) -> None:
     record_file = target.work / CHANGED / FINISHED
     if not record_file.is_file():
         return
-    recorded = Export.from_json(read_json(record_file)).files
+    recorded = DatasetRecord.from_json(read_json(record_file)).files
     changed: list[Path] = []
     for name, sha256 in recorded.items():
         file = target.folder / name
@@ -202,24 +202,22 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     failures = "outcome" in target.content.extras
     rewrites: dict[str, tuple[str, ...]] = {}
     outcome, language = run.outcome, run.config.plan.axes.language
-    episodes: dict[str, Known] = {}
+    facts: dict[str, EpisodeFacts] = {}
     for episode_id in shuffled(outcome.missed) if failures else outcome.kept:
-        row, content = outcome.row_of[episode_id], outcome.content(episode_id)
+        row = outcome.row_of[episode_id]
         rewrites[episode_id] = wordings(language, row.suite, row.task, row.perturbations)
-        content = digest(content, rewrites[episode_id])[:16]
-        steps = outcome.trajectories[row.trajectory_id]["steps"]
         task = task_of(row.suite, row.task, row.perturbations)
-        episodes[episode_id] = Known(
+        facts[episode_id] = EpisodeFacts(
             row.suite,
-            content,
-            row.demo_id,
-            row.instruction,
-            steps,
-            row.demo_origin_sha256,
-            task.bddl_file.stem if task.goal_file else "",
+            content=digest(outcome.content(episode_id), rewrites[episode_id])[:16],
+            demo=row.demo_id,
+            instruction=row.instruction,
+            steps=outcome.trajectories[row.trajectory_id]["steps"],
+            origin=row.demo_origin_sha256,
+            scene=task.bddl_file.stem if task.goal_file else "",
         )
     load = run.episodes(failures=failures, rewrites=rewrites, replays=target.stores_replay)
-    return Episodes(episodes, load)
+    return Episodes(facts, load)
 
 
 def wordings(axis: LanguageAxis | None, suite: str, task: str, perturbations: str) -> tuple[str, ...]:
@@ -244,7 +242,7 @@ def _wordings(axis: LanguageAxis, task: Task, *, other_objects: bool) -> tuple[s
 
 def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:
     """Return everything that the bytes of a dataset depend on. Its request consists of episodes and options."""
-    contents = [episode.content for episode in episodes.known.values()]
+    contents = [episode.content for episode in episodes.facts.values()]
     identity = digest(
         "export",
         target.name,
@@ -388,7 +386,7 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         files = {path.relative_to(dataset).as_posix(): sha256 for path, sha256 in zip(paths, checksums, strict=True)}
         with replaced(finished) as temporary:
             sizes = {path.relative_to(dataset).as_posix(): path.stat().st_size for path in paths}
-            record = Export(basis, files, places, sizes)
+            record = DatasetRecord(basis, files, places, sizes)
             temporary.write_text(json.dumps(record.to_json(), indent=0) + "\n")
     _replace(target, work)
 

@@ -18,7 +18,7 @@ from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Row
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
@@ -139,7 +139,7 @@ def _rebuild(
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(out, settings.render, rewrites={row["episode_id"]: json.loads(row["rewrites"])})
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), content)
-    export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
+    export(rebuilt, Episodes({row["episode_id"]: EpisodeFacts(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")
     return _record(shard, 0), "kept"
 

@@ -19,7 +19,7 @@ from pipeline.compute.pool import loop
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats import exact_statistics, rlds_write
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.rlds_layout import datasets
 from pipeline.run.export import export
@@ -71,7 +71,7 @@ def grey(jpeg: bytes) -> int:
 
 def write(data: Path, load: Callable[[str], Episode] = episode) -> Path:
     """A run's data folder with one dataset and its statistics; the writer's own check is the caller's to disarm."""
-    known = {name: Known("libero_tiny") for name in LENGTHS}
+    known = {name: EpisodeFacts("libero_tiny") for name in LENGTHS}
     export(Rlds(data, RldsConfig(name="libero", shards=2)), Episodes(known, load), loop)
     episodes = [load(name) for name in LENGTHS]
     figures = exact_statistics.openvla([(made.action, made.state) for made in episodes])

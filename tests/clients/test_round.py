@@ -32,7 +32,7 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.export_config import ExportConfig
 from pipeline.formats import exact_statistics
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.libero.starts import kept_actions
@@ -71,7 +71,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with the demonstrations in every format, and what clients normalise by."""
     data = tmp_path_factory.mktemp("round")
     made = {one: demonstration(one) for one in DEMOS}
-    known = {one: Known("libero_spatial", "content", "", each.instruction, len(each)) for one, each in made.items()}
+    known = {
+        one: EpisodeFacts("libero_spatial", "content", "", each.instruction, len(each)) for one, each in made.items()
+    }
     v21 = LeRobotV21Config(name=NAME, convention="openpi")
     rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
     for target in (Rlds(data, rlds), LeRobot(data, lerobot), LeRobotV21(data, v21)):

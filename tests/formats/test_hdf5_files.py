@@ -23,7 +23,7 @@ from synthetic import EXTRAS, IDS, NAME, TASK, episode, files, loaded_packages, 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Row
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.hdf5 import Hdf5, Hdf5Config
 from pipeline.run.export import export
 from pipeline.types import Episode, Subtask, Trajectory, Verdict
@@ -178,10 +178,12 @@ def test_bytes_do_not_depend_on_the_workers(folder: Path, tmp_path: Path) -> Non
 
 
 def test_validation_episodes_are_in_files_of_their_own(tmp_path: Path) -> None:
-    known: dict[str, Known] = {}
+    known: dict[str, EpisodeFacts] = {}
     for number, one in enumerate(IDS):
         source = episode(one)
-        known[one] = Known("libero_spatial", "content", f"{TASK}/demo_{number // 2}", source.instruction, len(source))
+        known[one] = EpisodeFacts(
+            "libero_spatial", "content", f"{TASK}/demo_{number // 2}", source.instruction, len(source)
+        )
     target = Hdf5(tmp_path, Hdf5Config(name=NAME, validation=0.34))
     export(target, Episodes(known, episode), loop)
     assert sorted(files(target.folder)) == [FILE, f"val/{FILE}"]

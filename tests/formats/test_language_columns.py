@@ -62,9 +62,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = episodes(told)
     # Three demonstrations of a task, of two episodes each.
     known = {
-        one: of._replace(demo=f"libero_spatial/task/demo_{k // 2}") for k, (one, of) in enumerate(source.known.items())
+        one: of._replace(demo=f"libero_spatial/task/demo_{k // 2}") for k, (one, of) in enumerate(source.facts.items())
     }
-    export(target, replace(source, known=known), loop)
+    export(target, replace(source, facts=known), loop)
     return target.root
 
 

@@ -30,7 +30,7 @@ from pipeline.clients import recipe
 from pipeline.clients.files import OPENPI_ASSETS
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, Where
-from pipeline.formats.episodes import Episodes, Known, split
+from pipeline.formats.episodes import EpisodeFacts, Episodes, split
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, records
@@ -44,7 +44,9 @@ DEMOS = {episode_id: f"libero_spatial/task/demo_{number // 2}" for number, episo
 @pytest.fixture(scope="module")
 def episodes() -> Episodes:
     made = {one: episode(one) for one in IDS}
-    known = {one: Known("libero_spatial", "content", DEMOS[one], made[one].instruction, len(made[one])) for one in IDS}
+    known = {
+        one: EpisodeFacts("libero_spatial", "content", DEMOS[one], made[one].instruction, len(made[one])) for one in IDS
+    }
     return Episodes(known, episode)
 
 
@@ -62,7 +64,7 @@ def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
 def test_all_that_was_made_from_one_demonstration_is_on_one_side(episodes: Episodes) -> None:
     """Expanded demonstrations may have bit-identical actions, such as the second and the third here."""
     origins = dict(zip(IDS, ("a", "a", "b", "b", "b", "b"), strict=True))
-    known = {one: value._replace(origin=origins[one]) for one, value in episodes.known.items()}
+    known = {one: value._replace(origin=origins[one]) for one, value in episodes.facts.items()}
     for share in (0.3, 0.4, 0.5):
         splits = Episodes(known, episode).by_split(share)
         sides = [{origins[one] for one in ids} for ids in splits.values()]
@@ -98,7 +100,7 @@ def test_each_suite_of_rlds_must_have_a_validation_split() -> None:
 def test_as_many_demonstrations_as_a_refusal_asks_for_are_enough_and_one_fewer_is_not(share: float) -> None:
     def splits(demonstrations: int) -> dict[str, list[str]]:
         ids = [f"{number}" for number in range(demonstrations)]
-        known = {name: Known("libero_goal", demo=f"libero_goal/task/demo_{name}") for name in ids}
+        known = {name: EpisodeFacts("libero_goal", demo=f"libero_goal/task/demo_{name}") for name in ids}
         return Episodes(known, episode).by_split(share)
 
     with pytest.raises(PipelineError) as caught:

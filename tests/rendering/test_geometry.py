@@ -25,7 +25,7 @@ from pipeline.compute.pool import loop
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.annotations import TRACE_STEPS, event_annotations
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.libero import bddl
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import Stream
@@ -238,7 +238,8 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     kept = [row for row in rows if outcome[row.episode_id].kept]
     load = EpisodeLoader(data, config.render)
     known = {
-        row.episode_id: Known(row.suite, "", row.demo_id, row.instruction, len(load(row.episode_id))) for row in kept
+        row.episode_id: EpisodeFacts(row.suite, "", row.demo_id, row.instruction, len(load(row.episode_id)))
+        for row in kept
     }
     for target in config.export.datasets(data, config.render.content):
         export(target, Episodes(known, load), loop)

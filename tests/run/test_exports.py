@@ -15,7 +15,7 @@ from synthetic import IDS, episode, episodes, files, loop
 
 from pipeline.files import checksum
 from pipeline.formats import lerobot
-from pipeline.formats.base import Export, Format
+from pipeline.formats.base import DatasetRecord, Format
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.record import Basis
@@ -93,7 +93,7 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
     made, source = target(name, tmp_path), episodes()
     made.folder.mkdir()
     (made.folder / "earlier").write_text("dataset")
-    record = Export(Basis("earlier", "earlier"), {"earlier": checksum(made.folder / "earlier")})
+    record = DatasetRecord(Basis("earlier", "earlier"), {"earlier": checksum(made.folder / "earlier")})
     made.record_file.write_text(json.dumps(record.to_json()))
     code = f"import test_exports as t, pathlib; t.killed_export({name!r}, pathlib.Path({str(tmp_path)!r}), {where!r})"
     done = subprocess.run(
@@ -152,9 +152,9 @@ def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_p
     assert stamps(made.folder) == before
     assert not (tmp_path / ".work").exists()
 
-    changed = replace(source, known={**source.known, IDS[0]: source.known[IDS[0]]._replace(content="second")})
+    changed = replace(source, facts={**source.facts, IDS[0]: source.facts[IDS[0]]._replace(content="second")})
     assert not is_up_to_date(made, changed)
-    assert not is_up_to_date(made, replace(source, known=dict([*source.known.items()][1:])))
+    assert not is_up_to_date(made, replace(source, facts=dict([*source.facts.items()][1:])))
     other = type(made)(tmp_path, made.options.model_copy(update={"name": "other"}))
     assert not is_up_to_date(other, source)
     content = first.read_bytes()

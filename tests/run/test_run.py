@@ -367,7 +367,7 @@ def test_every_format_gets_rewrites_and_subtasks(
     # Where lerobot is older, reading a configuration refuses it.
     told = LeRobot(config.data, plain.options.model_copy(update={"language": True}))
     episodes, given = (episodes_of(target, Run(config)) for target in (plain, told))
-    assert {one.content for one in given.known.values()} == {one.content for one in episodes.known.values()}
+    assert {one.content for one in given.facts.values()} == {one.content for one in episodes.facts.values()}
     bank = yaml.safe_load(BANK_FILE.read_text())
     for row in (row for row in rows if row["kept"]):
         episode, before = given.load(row["episode_id"]), episodes.load(row["episode_id"])

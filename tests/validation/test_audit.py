@@ -20,7 +20,7 @@ from synthetic import IDS, NAME, episode, loop
 from pipeline.__main__ import main
 from pipeline.axes import AXES
 from pipeline.errors import PipelineError
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.libero.arenas import ARENAS, Arena
@@ -83,7 +83,7 @@ def datasets(test: TestSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
 
     out = tmp_path_factory.mktemp("planted")
-    known = {one: Known("libero_goal", "planted", "", texts[one], len(episode(one))) for one in IDS}
+    known = {one: EpisodeFacts("libero_goal", "planted", "", texts[one], len(episode(one))) for one in IDS}
     for target in (
         Rlds(out, RldsConfig(name=NAME, shards=2)),
         LeRobot(out, LeRobotConfig(name=NAME, shards=1)),

@@ -216,7 +216,7 @@ def test_a_demonstration_in_both_splits_is_found(name: str, tmp_path: Path) -> N
     from pipeline.run.export import export
 
     made = episodes()
-    known = {one: of._replace(demo=f"libero_spatial/bowl/demo_{k}") for k, (one, of) in enumerate(made.known.items())}
+    known = {one: of._replace(demo=f"libero_spatial/bowl/demo_{k}") for k, (one, of) in enumerate(made.facts.items())}
     target: Format[Any] = (
         LeRobot(tmp_path, LeRobotConfig(name="synthetic", shards=3, validation=0.4))
         if name == "lerobot"

@@ -66,7 +66,7 @@ class Hdf5(Format[Hdf5Config]):
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
         for split_name, members in episodes.by_split(self.options.validation).items():
-            by_task = grouped((episodes.known[episode_id].played, episode_id) for episode_id in members)
+            by_task = grouped((episodes.facts[episode_id].played, episode_id) for episode_id in members)
             for task, ids in sorted(by_task.items()):
                 pieces.append(Piece(f"dataset/{layout.file_of(task, split_name)}", ids, split_name))
         return pieces

@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
 from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
-from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
+from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, number_pieces, split
 from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Action, Convention, Depth
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
@@ -157,12 +157,12 @@ class LeRobot(Format[LeRobotConfig]):
         """
         slices: dict[str, tuple[str, Sequence[str]]] = {}
         for split_name, members in episodes.by_split(self.options.validation).items():
-            share = ceil((self.options.shards or 0) * len(members) / len(episodes.known))
-            steps = sum(episodes.known[episode_id].steps for episode_id in members)
+            share = ceil((self.options.shards or 0) * len(members) / len(episodes.facts))
+            steps = sum(episodes.facts[episode_id].steps for episode_id in members)
             least = ceil(steps / self._steps_of_a_file())
             for ids in split(members, max(1, share, least)):
                 slices[f"files/{len(slices):05d}"] = split_name, ids
-        return in_a_row(slices, episodes.known)
+        return number_pieces(slices, episodes.facts)
 
     def sets(self, pieces: Sequence[Piece]) -> set[str]:
         return {self.options.name}
@@ -314,13 +314,13 @@ class LeRobotV21(Format[LeRobotV21Config]):
         for split_name, members in episodes.by_split(self.options.validation).items():
             sets = {self.options.name: members}
             if self.options.convention == "ipec":
-                suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
+                suites = {episode_id: episodes.facts[episode_id].suite for episode_id in members}
                 sets = by_suite(suites, self.options.name)
             for name, ids in sets.items():
                 folder = f"files/{name}" if split_name == "train" else f"files/{name}_{split_name}"
                 parts = split(ids, -(-len(ids) // EPISODES_OF_A_PIECE))
                 slices = {f"{folder}/{number:05d}": (split_name, part) for number, part in enumerate(parts)}
-                pieces += in_a_row(slices, episodes.known)
+                pieces += number_pieces(slices, episodes.facts)
         return pieces
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
