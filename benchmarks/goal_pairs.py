@@ -45,7 +45,7 @@ def yields(suite: str, start: int, folder: Path) -> dict[str, object]:
         (twin,) = plan.twins([entry], 0, settings)
         ReplayJob(twin, twin.trajectory_id, demos, settings, folder)()
         change = GoalPerturbation(scene=pair.scene.name, start=start, level=level(pair.task, pair.scene))
-        row = plan.row(entry, [change], 0, settings)
+        row = plan.build_row(entry, [change], 0, settings)
         verdict = ReplayJob(row, twin.trajectory_id, demos, settings, folder)()
         reasons[verdict.reason] += 1
         held = " (held out)" if (pair.task, pair.scene) in held_out(suite) else ""

@@ -180,7 +180,7 @@ def render(run: Run) -> None:
     reject_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
     dropped.reject_deletion(rows, run)
     # The configuration may have changed since the plan was written.
-    config.export.reject_too_few(plan.demonstrations(rows))
+    config.export.reject_too_few(plan.count_demonstrations(rows))
     replayed = int(read_json(run.path(REPLAY))["replayed"])
     with run.workers(renders=True) as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)

@@ -239,7 +239,7 @@ class Axis(Frozen):
         """Return whether perturbations keep their clearance to the test tasks."""
         return True
 
-    def reject_tested(self, test: TestSet, task: Task) -> None:
+    def reject_levels_without_clearance(self, test: TestSet, task: Task) -> None:
         """Reject levels without any perturbation that keeps its clearance, as far as the ranges show this.
 
         Otherwise, perturbations of other levels would silently take their place in a plan.

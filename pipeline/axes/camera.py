@@ -366,7 +366,7 @@ class CameraAxis(Axis):
         """Return whether cameras keep their clearance to the test cameras."""
         return self.clear_by != "off"
 
-    def reject_tested(self, test: TestSet, task: Task) -> None:
+    def reject_levels_without_clearance(self, test: TestSet, task: Task) -> None:
         """Reject a component with a level at which the ranges have no camera at its clearance from the test cameras.
 
         Raises:

@@ -185,7 +185,7 @@ class NoiseAxis(Axis):
             "glass": self.glass,
         }
 
-    def reject_tested(self, test: TestSet, task: Task) -> None:
+    def reject_levels_without_clearance(self, test: TestSet, task: Task) -> None:
         """Reject a row that is too near to a severity of the benchmark, because its level has no other perturbation.
 
         Raises:

@@ -117,7 +117,7 @@ def _plan_entry(
     alike = grouped(((task.suite, is_in_tested_scene(task)), task) for task in demos_of)
     for axis in sampler.axes:
         for tasks in alike.values():
-            axis.reject_tested(test, tasks[0])
+            axis.reject_levels_without_clearance(test, tasks[0])
     # Each axis has its own order. Else small numbers of episodes would use the same tasks on all axes.
     ordered = sorted(demos_of, key=lambda task: digest(plan.seed, name, task.suite, task.name))
     weights = [plan.task_weights.get(str(task), 1.0) for task in ordered]
@@ -128,7 +128,7 @@ def _plan_entry(
         shuffled = sorted(demos, key=lambda demo: digest(plan.seed, name, demo.demo_id))
         candidates = islice(_candidates(sampler, shuffled), wanted + ceil(wanted * plan.reserve))
         for rank, (demo, perturbations, variant) in enumerate(candidates):
-            candidate = row(demo, perturbations, plan.seed, replay)
+            candidate = build_row(demo, perturbations, plan.seed, replay)
             rows.append(replace(candidate, rank=rank, variant=variant, wanted=rank < wanted))
     return rows
 
@@ -159,7 +159,7 @@ def _all_apply(axes: Sequence[Axis], task: Task) -> bool:
 
 def twins(demos: Sequence[DemoEntry], seed: int, replay: ReplayConfig) -> list[Row]:
     """Return the clean twin of each demonstration of a task."""
-    return [replace(row(demo, (), seed, replay), rank=rank) for rank, demo in enumerate(demos)]
+    return [replace(build_row(demo, (), seed, replay), rank=rank) for rank, demo in enumerate(demos)]
 
 
 def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, replay: ReplayConfig) -> list[Row]:
@@ -196,7 +196,7 @@ def reject_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
             )
 
 
-def demonstrations(rows: Sequence[Row]) -> dict[str, int]:
+def count_demonstrations(rows: Sequence[Row]) -> dict[str, int]:
     """Count the demonstrations of the task with most demonstrations, for each suite.
 
     Demonstrations of one origin count once.
@@ -302,7 +302,7 @@ class Sampler:
             key = (demo_id, variant)
             for attempt in range(_ATTEMPTS):
                 choices = self._sample_axes(task, attempt, taken, earlier, key)
-                perturbations = self._clear_all(choices, (*key, attempt))
+                perturbations = self._sample_all_clear(choices, (*key, attempt))
                 content = tuple(perturbation.model_dump_json() for perturbation in perturbations or ())
                 if perturbations and content not in sampled:
                     break
@@ -330,19 +330,21 @@ class Sampler:
                 earlier = ()
         return choices
 
-    def _clear_all(self, choices: Sequence[_Choice], key: tuple[str | int, ...]) -> tuple[Perturbation, ...] | None:
-        """Return one perturbation of each choice, or ``None`` if an axis has none that passes ``_clear``."""
+    def _sample_all_clear(
+        self, choices: Sequence[_Choice], key: tuple[str | int, ...]
+    ) -> tuple[Perturbation, ...] | None:
+        """Return one perturbation of each choice, or ``None`` if an axis has none that is clear."""
         texts = [choice.perturbation for choice in choices]
         instruction = " ".join(change.apply("") for change in texts if isinstance(change, TextPerturbation))
         perturbations = []
         for number, choice in enumerate(choices):
-            clear = self._clear(choice, instruction, (*key, number))
+            clear = self._sample_clear(choice, instruction, (*key, number))
             if clear is None:
                 return None
             perturbations.append(clear)
         return tuple(perturbations)
 
-    def _clear(self, choice: _Choice, instruction: str, key: tuple[str | int, ...]) -> Perturbation | None:
+    def _sample_clear(self, choice: _Choice, instruction: str, key: tuple[str | int, ...]) -> Perturbation | None:
         """Return the chosen perturbation if it is clear, else sample a clear one of its component and level.
 
         A clear perturbation keeps its clearance to the test set, unless the axis keeps none, and the ``instruction``
@@ -416,7 +418,7 @@ def _candidates(
             return
 
 
-def row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, replay: ReplayConfig) -> Row:
+def build_row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, replay: ReplayConfig) -> Row:
     """Build the row of a wanted episode, with rank and variant 0."""
     perturbations = in_order(perturbations)
     physics = to_json(of_layer(perturbations, PhysicsPerturbation))

@@ -194,7 +194,7 @@ def combinations(
         if not axis.applies(demo.task):
             what = f"the axis {axis_name} cannot change the task {demo.task}"
             raise PipelineError(what, remedy="choose another task or another axis")
-        axis.reject_tested(test, demo.task)
+        axis.reject_levels_without_clearance(test, demo.task)
     draws = Sampler(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
     left = list(islice(draws, CANDIDATES))
     chosen: list[tuple[Perturbation, ...]] = []

@@ -28,7 +28,7 @@ def make(config: Config) -> list[plan.Row]:
         print(note, file=sys.stderr)
     config.demos.reject_tasks_without(index.entries)
     rows = plan.make(index.entries, config.plan, config.replay, benchmark.load())
-    config.export.reject_too_few(plan.demonstrations(rows))
+    config.export.reject_too_few(plan.count_demonstrations(rows))
     return rows
 
 

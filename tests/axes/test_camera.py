@@ -233,14 +233,14 @@ def test_a_task_of_libero_90_in_a_tested_scene_keeps_its_clearance(test_set: Tes
 
 
 def test_ranges_without_a_clear_camera_are_rejected(test_set: TestSet) -> None:
-    CameraAxis().reject_tested(test_set, MILK)
+    CameraAxis().reject_levels_without_clearance(test_set, MILK)
     near = CameraAxis.model_validate({"components": ["orientation"], "levels": [2, 5]})
     with pytest.raises(PipelineError, match=r"no orientation camera of level 2, 5 .* 5 degrees(?s:.*)clear_by: off"):
-        near.reject_tested(test_set, MILK)
-    near.reject_tested(test_set, OF_LIBERO_90)
-    near.model_copy(update={"clear_by": "off"}).reject_tested(test_set, MILK)
+        near.reject_levels_without_clearance(test_set, MILK)
+    near.reject_levels_without_clearance(test_set, OF_LIBERO_90)
+    near.model_copy(update={"clear_by": "off"}).reject_levels_without_clearance(test_set, MILK)
     low = {"components": ["spherical"], "spherical": {"elevation_deg": [[5.1, 9.9]]}, "clear_by": "resample"}
-    CameraAxis.model_validate(low).reject_tested(test_set, MILK)
+    CameraAxis.model_validate(low).reject_levels_without_clearance(test_set, MILK)
 
 
 def test_default_draws_are_mostly_clear_of_every_test_camera(test_set: TestSet) -> None:

@@ -251,7 +251,7 @@ def test_an_edited_scene_of_an_own_suite_gives_other_episodes(tmp_path: Path, mo
         task = find_task("kitchen", "pack_milk")
         entry = DemoEntry(task, "demo_0", "recorded", "human", "a" * 64, 100)
         made = GoalAxis().sample(rng("own"), task, 0)
-        row = plan.row(entry, [made], 0, ReplayConfig())
+        row = plan.build_row(entry, [made], 0, ReplayConfig())
         config = {"name": "own", "demos": {"root": "demos", "tasks": [str(task)]}, "plan": plan_of_run}
         listed = inputs.listing(Config.model_validate(config))
         found.append((row.episode_id, row.trajectory_id, listed[f"tasks/kitchen/{made.scene}.bddl"]))
@@ -301,7 +301,7 @@ def test_a_kept_replay_repeats_in_liberos_own_environment_of_the_scene(
     assert ReplayJob(twin, twin.trajectory_id, demos, settings, tmp_path)().kept
     strength = level(demo.task, find_task(suite, scene))
     change = GoalPerturbation(scene=scene, start=0, level=strength)
-    row = plan.row(entry, (change,), 0, settings)
+    row = plan.build_row(entry, (change,), 0, settings)
     assert ReplayJob(row, twin.trajectory_id, demos, settings, tmp_path)().kept
     trajectory = TrajectoryStore(tmp_path).load(row.trajectory_id)
     assert trajectory.mode == "tracked"

@@ -101,7 +101,7 @@ def test_goals_that_a_plan_trains_on_are_left_out(tmp_path: Path, capsys: pytest
     config, file = tmp_path / "mine.yaml", tmp_path / "mine" / "plan.parquet"
     config.write_text(f"name: mine\nfolder: {tmp_path}\nplan:\n  episodes: {{robot: 1}}\n")
     file.parent.mkdir()
-    plan.write([plan.row(entry, (change,), 0, ReplayConfig())], file)
+    plan.write([plan.build_row(entry, (change,), 0, ReplayConfig())], file)
     wanted = select(Selection(source="goals", suites=("libero_object",)))
     left = not_trained(wanted, file)
     (out,) = set(wanted) - set(left)

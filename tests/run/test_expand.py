@@ -109,7 +109,7 @@ def test_what_is_expanded_twice_still_has_the_origin_of_the_human_one(expanded: 
     assert len({entry.sha256 for entry in entries}) == 2
     rows = plan.twins(entries, 1, ReplayConfig())
     assert {row.demo_origin_sha256 for row in rows} == {starter_demo(STOVE).sha256}
-    assert plan.demonstrations(rows) == {STOVE.suite: 1}
+    assert plan.count_demonstrations(rows) == {STOVE.suite: 1}
 
 
 def test_the_file_tells_nobody_s_folders_and_liberos_own_reader_finds_its_assets(
