@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.axes.language import LanguagePerturbation, deal
+from pipeline.axes.language import LanguagePerturbation, list_rewrites
 from pipeline.libero.tasks import tasks
 from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.testset import benchmark
@@ -36,7 +36,7 @@ def main() -> None:
     tested: dict[Task, list[str]] = {}
     for task in every:
         tested[task] = [str(test_task.parameters["text"]) for test_task in test.on(task, "language")]
-    cards = {task: deal(task) for task in every}
+    cards = {task: list_rewrites(task) for task in every}
     sentences = [*chain(*tested.values()), *(card.text for card in chain(*cards.values()))]
     vectors = iter(embedded(python, sentences))
     tests = {task: take(vectors, len(texts)) for task, texts in tested.items()}

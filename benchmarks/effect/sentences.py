@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes.language import deal
+from pipeline.axes.language import list_rewrites
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.tasks import find_task
@@ -41,7 +41,7 @@ def used(tasks: Iterable[str]) -> list[str]:
     for name in tasks:
         task = find_task(*name.split("/"))
         tested = [str(test_task.parameters["text"]) for test_task in test.on(task, "language")]
-        texts += [task.instruction, *(rewrite.text for rewrite in deal(task)), *tested]
+        texts += [task.instruction, *(rewrite.text for rewrite in list_rewrites(task)), *tested]
     return list(dict.fromkeys(texts))
 
 

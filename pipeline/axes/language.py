@@ -13,7 +13,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
@@ -37,7 +37,7 @@ Bank = dict[str, dict[str, dict[Component, tuple[str, ...]]]]
 """Suite to task name to class to rewrites."""
 
 BANK_FILE = Path(__file__).with_name("language_bank.yaml")
-LEVELS = (0.5, 0.6, 0.67, 0.72)
+LEVEL_STARTS = (0.5, 0.6, 0.67, 0.72)
 """Distances to the original wording at which the levels 2 to 5 begin."""
 
 
@@ -138,12 +138,12 @@ class LanguageAxis(Axis):
         return False
 
     def entries(self, task: Task) -> tuple[str, ...]:
-        """List the task's rewrites in the order of ``deal``.
+        """List the task's rewrites in the order of ``list_rewrites``.
 
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
-        return tuple(rewrite.text for rewrite in deal(task, self.components, self.levels, self.bank))
+        return tuple(rewrite.text for rewrite in list_rewrites(task, self.components, self.levels, self.bank))
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
         """Return the rewrite at ``place`` of the task's list, which starts again at its end.
@@ -153,7 +153,7 @@ class LanguageAxis(Axis):
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
-        rewrites = deal(task, self.components, self.levels, self.bank)
+        rewrites = list_rewrites(task, self.components, self.levels, self.bank)
         return rewrites[place % len(rewrites)]
 
     def wordings(self, task: Task, test: TestSet, *, other_objects: bool = False) -> tuple[str, ...]:
@@ -169,7 +169,7 @@ class LanguageAxis(Axis):
             PipelineError: when one of the rewrites does not pass ``lint``.
         """
         texts = []
-        for rewrite in _dealt(task, self._select_components(other_objects=other_objects), self.levels, self.bank):
+        for rewrite in _find_rewrites(task, self._select_components(other_objects=other_objects), self.levels, self.bank):
             if rewrite.nearest(test, task).distance >= rewrite.clearance:
                 texts.append(rewrite.text)
         return tuple(texts)
@@ -250,7 +250,7 @@ def load_further_bank(file: Path) -> Bank:
     return bank
 
 
-def deal(
+def list_rewrites(
     task: Task,
     classes: tuple[Component, ...] = CLASSES,
     levels: tuple[Level, ...] = get_args(Level),
@@ -261,9 +261,9 @@ def deal(
     Raises:
         PipelineError: when there are none, or one of them does not pass ``lint``.
     """
-    dealt = _dealt(task, classes, levels, bank)
-    if dealt:
-        return dealt
+    rewrites = _find_rewrites(task, classes, levels, bank)
+    if rewrites:
+        return rewrites
     raise PipelineError(
         f"task {task} has no rewrites of class {' or '.join(classes)} at level {' or '.join(map(str, levels))}",
         where=bank or BANK_FILE,
@@ -273,10 +273,10 @@ def deal(
 
 
 @cache
-def _dealt(
+def _find_rewrites(
     task: Task, classes: tuple[Component, ...], levels: tuple[Level, ...], bank: Path | None
 ) -> tuple[LanguagePerturbation, ...]:
-    """List all rewrites of a task in the order of ``deal``; empty if there are none.
+    """Return the result of ``list_rewrites``, or an empty tuple if there are none.
 
     Rewrites that lose their meaning in the scene that a task is carried to are left out.
 
@@ -286,11 +286,10 @@ def _dealt(
     stored = _stored(task, bank)
     turn = seeding.rng("language", task.suite, task.name).permutation(list(dict.fromkeys(classes)))
     columns = [_shuffled(task, component, tuple(stored[component]), levels) for component in turn.tolist()]
-    dealt: list[LanguagePerturbation] = []
-    for row in zip_longest(*columns):
-        dealt += [rewrite for rewrite in row if rewrite is not None]
     keeping: list[LanguagePerturbation] = []
-    for rewrite in dealt:
+    for rewrite in chain.from_iterable(zip_longest(*columns)):
+        if rewrite is None:
+            continue
         fault = lint(rewrite.text, task, rewrite.component)
         if not fault:
             keeping.append(rewrite)
@@ -337,8 +336,8 @@ def _shuffled(
 
 
 def level_of(text: str, original: str) -> Level:
-    """Return the strength of a rewrite, by the ranges of ``LEVELS``."""
-    level: Level = get_args(Level)[bisect.bisect_right(LEVELS, distance(text, original))]
+    """Return the strength of a rewrite, by the ranges of ``LEVEL_STARTS``."""
+    level: Level = get_args(Level)[bisect.bisect_right(LEVEL_STARTS, distance(text, original))]
     return level
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipeline.axes import TextPerturbation, from_json, of_layer
-from pipeline.axes.language import LanguagePerturbation, deal
+from pipeline.axes.language import LanguagePerturbation, list_rewrites
 from pipeline.catalogue.scene_files import portable
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, label_faults, labels_of
 from pipeline.formats.annotations import event_annotations, persistent_annotations
@@ -227,7 +227,7 @@ def wording(case: Case) -> Iterator[Fault]:
     expected = task.instruction
     for change in of_layer(from_json(case.row["perturbations"]), TextPerturbation):
         expected = change.apply(expected)
-        if isinstance(change, LanguagePerturbation) and change not in deal(task, bank=case.bank):
+        if isinstance(change, LanguagePerturbation) and change not in list_rewrites(task, bank=case.bank):
             yield case.finding("manifest", f"rewrite {change.text!r} is not in the bank", f"one for {task.name}")
     if text != expected:
         yield case.finding("manifest", f"instruction {text!r}", repr(expected))

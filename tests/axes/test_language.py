@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pipeline import seeding
 from pipeline.axes.base import Level
 from pipeline.axes.goal import GoalAxis
-from pipeline.axes.language import LanguageAxis, LanguagePerturbation, deal, distance, level_of, load_bank
+from pipeline.axes.language import LanguageAxis, LanguagePerturbation, distance, level_of, list_rewrites, load_bank
 from pipeline.axes.language_lint import CLASSES, NAMED, lint, normalise
 from pipeline.axes.layout import LayoutAxis
 from pipeline.axes.noise import NoiseAxis
@@ -191,7 +191,7 @@ def test_among_more_objects_things_are_called_by_their_names() -> None:
 
 
 def test_levels_follow_the_distance_to_the_original(task: Task) -> None:
-    cards = deal(task)
+    cards = list_rewrites(task)
     by_level = sorted(cards, key=lambda card: distance(card.text, task.instruction))
     assert [card.level for card in by_level] == sorted(card.level for card in cards)
     assert {card.text for card in cards if card.level == 1} == {
@@ -205,8 +205,8 @@ def test_only_the_levels_asked_for_are_drawn() -> None:
     for known in TASKS[::7]:
         drawn = [draw(known, variant, axis) for variant in range(60)]
         assert {card.level for card in drawn} <= set(levels)
-        assert {card.text for card in drawn} == {card.text for card in deal(known) if card.level in levels}
-    assert {card.level for known in TASKS for card in deal(known)} == {1, 2, 3, 4, 5}
+        assert {card.text for card in drawn} == {card.text for card in list_rewrites(known) if card.level in levels}
+    assert {card.level for known in TASKS for card in list_rewrites(known)} == {1, 2, 3, 4, 5}
 
 
 def slow_edits(one: str, two: str) -> int:
@@ -238,7 +238,7 @@ def test_the_bank_is_clear_of_the_test_set(task: Task, test: TestSet) -> None:
     tested = [str(other.parameters["text"]) for other in test.on(task, "language")]
     assert 10 < len(tested) <= 50
     close = []
-    for card in deal(task):
+    for card in list_rewrites(task):
         nearest = card.nearest(test, task)
         assert nearest.compared == len(tested)
         if nearest.distance < card.clearance:
@@ -272,10 +272,10 @@ def test_a_further_bank_joins_the_shipped_one(tmp_path: Path) -> None:
     bank = tmp_path / "bank.yaml"
     further = f"kindly {known.instruction}"
     bank.write_text(yaml.safe_dump({known.suite: {known.name: {"paraphrase": [further]}}}))
-    texts = {card.text for card in deal(known, CLASSES, bank=bank)}
-    assert texts - {card.text for card in deal(known)} == {further}
+    texts = {card.text for card in list_rewrites(known, CLASSES, bank=bank)}
+    assert texts - {card.text for card in list_rewrites(known)} == {further}
     with pytest.raises(PipelineError, match=r"missing\.yaml"):
-        deal(known, CLASSES, bank=tmp_path / "missing.yaml")
+        list_rewrites(known, CLASSES, bank=tmp_path / "missing.yaml")
 
 
 def test_wordings_are_a_tasks_own_without_the_benchmarks(tmp_path: Path, test: TestSet) -> None:
@@ -288,7 +288,7 @@ def test_wordings_are_a_tasks_own_without_the_benchmarks(tmp_path: Path, test: T
     texts = [str(tested.parameters["text"]) for tested in test.on(known, "language")]
     tested = next(text for text in texts if lint(text, known, "distraction") is None)
     bank.write_text(yaml.safe_dump({known.suite: {known.name: {"distraction": [tested]}}}))
-    assert tested in {card.text for card in deal(known, bank=bank)}
+    assert tested in {card.text for card in list_rewrites(known, bank=bank)}
     assert {*LanguageAxis(bank=bank).wordings(known, test)} == {*LanguageAxis().wordings(known, test)}
 
 
@@ -304,9 +304,9 @@ def test_of_a_wording_in_both_banks_and_two_classes_the_first_counts(tmp_path: P
     new = f"kindly {known.instruction}"
     further = {"distraction": [*again, new], "paraphrase": [*shipped, new.replace("kindly", "kindly,")]}
     bank.write_text(yaml.safe_dump({known.suite: {known.name: further}}))
-    drawn = {(card.component, card.text) for card in deal(known, bank=bank)}
-    assert drawn - {(card.component, card.text) for card in deal(known)} == {("distraction", new)}
-    assert len(deal(known, bank=bank)) == len(deal(known)) + 1
+    drawn = {(card.component, card.text) for card in list_rewrites(known, bank=bank)}
+    assert drawn - {(card.component, card.text) for card in list_rewrites(known)} == {("distraction", new)}
+    assert len(list_rewrites(known, bank=bank)) == len(list_rewrites(known)) + 1
 
 
 def test_a_bank_with_a_task_given_twice_is_refused(tmp_path: Path) -> None:
@@ -321,4 +321,4 @@ def test_a_further_bank_has_to_keep_the_goal(tmp_path: Path) -> None:
     text = "kindly put the bowl next to the plate"
     bank.write_text(yaml.safe_dump({BOWL_ON_PLATE.suite: {BOWL_ON_PLATE.name: {"paraphrase": [text]}}}))
     with pytest.raises(PipelineError, match=r"relation 'on' to the plate(?s:.*)language_words\.yaml"):
-        deal(BOWL_ON_PLATE, CLASSES, bank=bank)
+        list_rewrites(BOWL_ON_PLATE, CLASSES, bank=bank)

@@ -11,7 +11,7 @@ import own_task
 import pytest
 from conftest import BOWL, REPOSITORY
 
-from pipeline.axes.language import deal
+from pipeline.axes.language import list_rewrites
 from pipeline.compute.pool import loop
 from pipeline.config import Config, load
 from pipeline.libero import bddl
@@ -50,7 +50,7 @@ def test_the_files_of_the_page_are_valid(config: Config) -> None:
     assert definition.centres_m["akita_black_bowl_1"] == pytest.approx((-0.09, 0.0))
     reject_test_tasks([task])
     assert config.plan.axes.language is not None
-    assert len(deal(task, bank=config.plan.axes.language.bank)) == 2
+    assert len(list_rewrites(task, bank=config.plan.axes.language.bank)) == 2
 
 
 def test_the_arenas_of_the_page_are_liberos() -> None:

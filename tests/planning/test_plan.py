@@ -16,7 +16,7 @@ from pipeline.axes import Axes, from_json, to_json
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.base import LEVELS
 from pipeline.axes.camera import CameraAxis
-from pipeline.axes.language import LanguageAxis, LanguagePerturbation, deal
+from pipeline.axes.language import LanguageAxis, LanguagePerturbation, list_rewrites
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
@@ -189,7 +189,7 @@ def test_an_exhausted_axis_is_said_and_planned_as_far_as_it_goes() -> None:
     wanted = config(axes=Axes(language=LanguageAxis()), episodes={"language": 300})
     rows = plan.make(entries(1), wanted, REPLAY, NO_TESTS)
     texts = {(row.task, row.instruction) for row in rows if row.axis == "language"}
-    bank = {(task.name, drawn.text) for task in TASKS for drawn in deal(task, LanguageAxis().components)}
+    bank = {(task.name, drawn.text) for task in TASKS for drawn in list_rewrites(task, LanguageAxis().components)}
     assert texts == bank, "every rewrite once"
     assert plan.shortage(rows, wanted) == {"language": 300 - len(bank)}
     assert plan.shortage(plan.make(entries(), config(), REPLAY, NO_TESTS), config()) == {}
@@ -246,7 +246,7 @@ def test_a_rewrite_stays_where_what_is_beside_it_is_drawn_anew() -> None:
     """So that all of a task's are drawn once before one comes again."""
     axes = (CameraAxis(), LanguageAxis())
     of = ("camera+language", axes, 3)
-    number = len(deal(TASKS[0]))
+    number = len(list_rewrites(TASKS[0]))
     first = [*islice(plan.Sampler(*of, NO_TESTS).sample("demo_0", TASKS[0]), number)]
     names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
     planted = [
@@ -275,10 +275,10 @@ def test_fifty_demonstrations_have_fifty_different_rewrites() -> None:
     dealt = rewrites_of_demonstrations(names)
     assert len(dealt) == len(set(dealt.values())) == 50
     assert rewrites_of_demonstrations(names[::-1]) == dealt
-    assert len(deal(TASKS[0])) < 70
+    assert len(list_rewrites(TASKS[0])) < 70
     times = Counter(rewrites_of_demonstrations([f"demo_{number}" for number in range(140)]).values())
     assert max(times.values()) - min(times.values()) == 1, "each comes twice before one comes a third time"
-    assert set(times) == {card.text for card in deal(TASKS[0])}
+    assert set(times) == {card.text for card in list_rewrites(TASKS[0])}
 
 
 def test_another_demonstration_changes_few_rewrites_of_the_others() -> None:

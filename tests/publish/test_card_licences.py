@@ -7,7 +7,7 @@ from card_of_run import BACKGROUND, LAYOUT, ROWS, cells, metadata_of, row, write
 from conftest import STOVE
 
 from pipeline.axes.background import BackgroundPerturbation
-from pipeline.axes.language import LanguagePerturbation, deal
+from pipeline.axes.language import LanguagePerturbation, list_rewrites
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_only_the_starter_sets_demonstrations_are_called_human(data: Path) -> No
 
 
 def test_rewrites_of_another_bank_are_not_licensed(data: Path) -> None:
-    shipped = deal(STOVE)[0]
+    shipped = list_rewrites(STOVE)[0]
     write_rows(data, [row("clean", task=STOVE), row("language", shipped, task=STOVE)])
     text = written(data, "rlds")
     assert "that generated this dataset are under MIT.\n" in text

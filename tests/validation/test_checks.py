@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from synthetic import IDS, episode
 
 from pipeline.axes import Axes, to_json
-from pipeline.axes.language import LanguagePerturbation, deal
+from pipeline.axes.language import LanguagePerturbation, list_rewrites
 from pipeline.axes.noise import NoiseAxis
 from pipeline.config import PlanConfig, RenderConfig, ReplayConfig
 from pipeline.files import write_json
@@ -62,7 +62,7 @@ def test_frames_of_another_motion_than_the_replays_are_found() -> None:
 
 
 def test_a_rewrite_that_no_bank_has_is_found() -> None:
-    (drawn, *_) = deal(BOWL)
+    (drawn, *_) = list_rewrites(BOWL)
     strange = LanguagePerturbation(component="paraphrase", level=1, text="move the bowl over to the plate at last")
     for change, found in ((drawn, []), (strange, [f"rewrite {strange.text!r} is not in the bank"])):
         row = {"suite": BOWL.suite, "task": BOWL.name, "perturbations": to_json([change]), "instruction": change.text}

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.axes import to_json
-from pipeline.axes.language import deal
+from pipeline.axes.language import list_rewrites
 from pipeline.axes.language_lint import lint
 from pipeline.compute.pool import loop
 from pipeline.config import Config, DemosConfig
@@ -68,7 +68,7 @@ def test_a_task_of_ones_own(instruction: str, named: str, tmp_path: Path, monkey
 
 def worded(task: Task, text: str, bank: Path | None = None) -> list[str]:
     """What `validate` finds wrong with an instruction; of a bank, it is one of its rewrites."""
-    drawn = [one for one in deal(task, bank=bank) if one.text == text] if bank else []
+    drawn = [one for one in list_rewrites(task, bank=bank) if one.text == text] if bank else []
     row = {"suite": task.suite, "task": task.name, "instruction": text, "perturbations": to_json(drawn)}
     case: Any = SimpleNamespace(row=row, task=task, bank=bank, finding=lambda *told: told[1])
     found: Any = checks.wording(case)
