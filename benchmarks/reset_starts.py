@@ -28,7 +28,7 @@ from pipeline.physics.quality import smoothness
 from pipeline.planning import plan
 from pipeline.run.expand import REPLAY, ROUGH
 from pipeline.run.replay_stage import Replays
-from pipeline.scenes.compiled import physics_to_read
+from pipeline.scenes.compiled import compile_for_physics
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Floats, Task, Trajectory
 
@@ -96,7 +96,7 @@ class _Starts(NamedTuple):
 
     @classmethod
     def of(cls, states: Floats, model_xml: str) -> _Starts:
-        model = physics_to_read(model_xml)
+        model = compile_for_physics(model_xml)
         free = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
         # A flattened state begins with the time, and its positions with the arm's seven joints.
         return cls(states[:, 1:8] - HOME_RAD, states[:, 1 + free[:, None] + [0, 1]])

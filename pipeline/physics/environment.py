@@ -20,7 +20,7 @@ from pipeline.libero.carried import definition_of
 from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
 from pipeline.physics.without_images import images_left_out
-from pipeline.scenes.compiled import fixed_pose, grip_pose, physics_to_read
+from pipeline.scenes.compiled import compile_for_physics, fixed_pose, grip_pose
 from pipeline.scenes.flat_images import restore_images
 from pipeline.types import Floats, Push, Scene, Task
 
@@ -184,7 +184,7 @@ class Environment:
         """Open a scene like robosuite's ``reset_from_xml_string``, but reuse a recently compiled model."""
         from robosuite.utils.binding_utils import MjSim
 
-        env, model = self._env.env, copy.copy(physics_to_read(model_xml))
+        env, model = self._env.env, copy.copy(compile_for_physics(model_xml))
         env.close()
         env.sim = MjSim(model)
         env.sim.forward()

@@ -108,7 +108,7 @@ class Instances:
         return poses
 
 
-def see(
+def render_geometry(
     renderer: Renderer, trajectory: Trajectory, stream: Stream, instances: Instances | None, extras: Collection[Extra]
 ) -> Geometry:
     """Render the geometry of a stream's view of a trajectory.
@@ -119,11 +119,11 @@ def see(
     view = ALL_VIEWS[stream.view]
     maps: dict[Extra, list[bytes]] = {name: [] for name in MAPS if name in extras}
     boxes: list[NDArray[np.float32]] = []
-    drawn = {*MAPS, "boxes"} & set(extras)
+    needs_surfaces = bool({*MAPS, "boxes"} & set(extras))
     with renderer.perturbed(stream.changes):
         renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
         intrinsics, extrinsics = matrices(renderer, stream.view)
-        for step in range(len(trajectory.actions) if drawn else 0):
+        for step in range(len(trajectory.actions) if needs_surfaces else 0):
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             surfaces = renderer.surfaces(view.camera)
             if "depth" in maps:

@@ -6,6 +6,7 @@ perturb, restore, render, add noise, turn.
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,11 @@ from pipeline.images.jpeg import encode, to_policy
 from pipeline.physics.controller_goals import absolute_actions, first_posture
 from pipeline.physics.subtasks import subtasks_by_contacts
 from pipeline.planning.streams import Stream
-from pipeline.rendering.geometry import Instances, see
+from pipeline.rendering.geometry import Instances, render_geometry
 from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import FirstFrame
-from pipeline.scenes.compiled import contacts, grip_pose, proprioception
-from pipeline.types import Floats, Frame, Jpeg, Rendered, Task, Trajectory
+from pipeline.scenes.compiled import GripPose, contacts, grip_pose, proprioception
+from pipeline.types import Floats, Frame, Geometry, Jpeg, Rendered, Task, Trajectory
 
 Started = Mapping[str, Callable[[], Frame]]
 """View to a function that waits for its clean frame."""
@@ -40,22 +41,8 @@ def render(
     renderer = opened.renderer(trajectory.model_xml, render_config.size_px)
     has_names = render_config.content.has_names
     instances = Instances(renderer.model, task, trajectory.scene.resolved) if has_names else None
-    steps = range(len(trajectory.actions))
-    renderer.restore(first_posture(trajectory.scene, renderer.model), trajectory.site_alpha[0])
-    first_grip = grip_pose(renderer.data)
-    proprioceptions, grips, poses, pairs = [], [], [], []
-    for step in steps:
-        renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
-        proprioceptions.append(proprioception(renderer.data))
-        grips.append(grip_pose(renderer.data))
-        if instances:
-            poses.append(instances.poses(renderer.data))
-        pairs.append(contacts(renderer.data))
-    renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
-    pairs.append(contacts(renderer.data))
-    state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
-    goals = absolute_actions(trajectory.actions, first_grip, grips)
-    first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
+    measured = _measure_states(renderer, trajectory, instances)
+    first_frame = FirstFrame(renderer, trajectory, task, measured.state[:, :3].astype(float))
     encoded: dict[str, list[Jpeg]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}
     for stream in streams:
@@ -71,21 +58,60 @@ def render(
             for frames in frames_of_steps(renderer, trajectory, scene):
                 for stream, frame in zip(scene, frames, strict=True):
                     encoded[stream.stream_id].append(encode(frame, render_config.jpeg_quality))
-    views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in rejected)
+    geometry: dict[str, Geometry] = {}
+    for stream in dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in rejected):
+        geometry[stream.stream_id] = render_geometry(renderer, trajectory, stream, instances, render_config.extras)
     return Rendered(
         replay_mode=trajectory.mode,
-        state=state,
-        joint_state=joint_state,
+        state=measured.state,
+        joint_state=measured.joint_state,
         action=trajectory.actions.astype(np.float32),
-        action_absolute=goals.astype(np.float32),
+        action_absolute=absolute_actions(trajectory.actions, measured.first_grip, measured.grips).astype(np.float32),
         streams={stream_id: frames for stream_id, frames in encoded.items() if stream_id not in rejected},
         rejected=rejected,
-        geometry={view.stream_id: see(renderer, trajectory, view, instances, render_config.extras) for view in views},
-        object_poses=np.stack(poses) if "object_poses" in render_config.extras else None,
+        geometry=geometry,
+        object_poses=np.stack(measured.object_poses) if "object_poses" in render_config.extras else None,
         instances=instances.names if instances else (),
         quality=trajectory.quality,
-        subtasks=subtasks_by_contacts(trajectory, task, renderer.model, pairs),
+        subtasks=subtasks_by_contacts(trajectory, task, renderer.model, measured.contacts),
     )
+
+
+class _Measured(NamedTuple):
+    """Measurements in the stored states of a trajectory, which need no frames.
+
+    Attributes:
+        state, joint_state: as in ``Rendered``.
+        first_grip: the grip's pose in ``first_posture``.
+        grips: K poses of the grip, before each action.
+        object_poses: K arrays of poses, before each action; empty without instances.
+        contacts: pairs (C, 2) of bodies in contact in each of the K+1 states.
+    """
+
+    state: NDArray[np.float32]
+    joint_state: NDArray[np.float32]
+    first_grip: GripPose
+    grips: Sequence[GripPose]
+    object_poses: Sequence[NDArray[np.float32]]
+    contacts: Sequence[NDArray[np.intp]]
+
+
+def _measure_states(renderer: Renderer, trajectory: Trajectory, instances: Instances | None) -> _Measured:
+    """Restore every state of a trajectory, and measure the robot, the objects and the contacts in it."""
+    renderer.restore(first_posture(trajectory.scene, renderer.model), trajectory.site_alpha[0])
+    first_grip = grip_pose(renderer.data)
+    proprioceptions, grips, object_poses, pairs = [], [], [], []
+    for step in range(len(trajectory.actions)):
+        renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+        proprioceptions.append(proprioception(renderer.data))
+        grips.append(grip_pose(renderer.data))
+        if instances:
+            object_poses.append(instances.poses(renderer.data))
+        pairs.append(contacts(renderer.data))
+    renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
+    pairs.append(contacts(renderer.data))
+    state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
+    return _Measured(state, joint_state, first_grip, grips, object_poses, pairs)
 
 
 def frames_of(

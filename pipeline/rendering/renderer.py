@@ -14,7 +14,7 @@ from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SIZE_PX
 from pipeline.rendering.drawing import PlainDrawing, Surfaces, texels
 from pipeline.rendering.savings import drawing_of
-from pipeline.scenes.compiled import compiled
+from pipeline.scenes.compiled import compile_model
 from pipeline.types import Frame, State
 
 
@@ -31,7 +31,7 @@ class Renderer:
     """
 
     def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None, size_px: int = SIZE_PX):
-        self.model = compiled(scene) if isinstance(scene, str) else scene
+        self.model = compile_model(scene) if isinstance(scene, str) else scene
         self.site_alpha = self.model.site_rgba[:, 3].copy()
         self.data = mujoco.MjData(self.model)
         self.drawing = drawing or drawing_of(self.model, size_px)
@@ -146,7 +146,7 @@ class LastScene:
                 self._drawing.release()
             else:
                 self.close()
-            self._renderer = self._opened(compiled(scene) if isinstance(scene, str) else copy.copy(scene), size_px)
+            self._renderer = self._opened(compile_model(scene) if isinstance(scene, str) else copy.copy(scene), size_px)
         except BaseException:
             # The context may have parts of both scenes now.
             self.close()

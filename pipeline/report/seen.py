@@ -25,7 +25,7 @@ from pipeline.planning.plan import Row
 from pipeline.run import outcome
 from pipeline.run.finished import SEEN
 from pipeline.run.run import Run
-from pipeline.scenes.compiled import physics_to_read
+from pipeline.scenes.compiled import compile_for_physics
 from pipeline.scenes.look import Look
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task, Trajectory
@@ -157,7 +157,7 @@ class _Seen:
         """Return the state of an episode after ``step`` executed actions."""
         if (row.trajectory_id, step) not in self._looks:
             trajectory = self.trajectories.load(row.trajectory_id)
-            look = Look.of(physics_to_read(trajectory.model_xml), trajectory.states[step])
+            look = Look.of(compile_for_physics(trajectory.model_xml), trajectory.states[step])
             self._looks[row.trajectory_id, step] = look
         return self._looks[row.trajectory_id, step]
 
@@ -178,7 +178,7 @@ class _Observed:
 
     @property
     def model(self) -> mujoco.MjModel:
-        return physics_to_read(self._trajectory.model_xml)
+        return compile_for_physics(self._trajectory.model_xml)
 
     @property
     def resolved(self) -> Mapping[str, Any]:

@@ -35,7 +35,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import smoothness
 from pipeline.planning import plan, selection
 from pipeline.run.replay_stage import Replays
-from pipeline.scenes.compiled import CompiledScene, physics_to_read, proprioception
+from pipeline.scenes.compiled import CompiledScene, compile_for_physics, proprioception
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Scene, State, Task, Trajectory
@@ -239,7 +239,7 @@ class _Motion:
 @cache
 def _motion(store: TrajectoryStore, trajectory_id: str, task: Task) -> _Motion:
     trajectory = store.load(trajectory_id)
-    model = physics_to_read(trajectory.model_xml)
+    model = compile_for_physics(trajectory.model_xml)
     qpos = State.of(trajectory.states[0], model.nq).qpos
     free = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     # A state begins with the arm's seven joints.

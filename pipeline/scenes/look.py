@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.types import Floats
+from pipeline.types import Floats, State
 
 
 class Look(NamedTuple):
@@ -30,7 +30,7 @@ class Look(NamedTuple):
             state: (S,) flattened MuJoCo state of the model.
         """
         data, moving = mujoco.MjData(model), np.empty(6)
-        data.qpos[:], data.qvel[:] = state[1 : 1 + model.nq], state[1 + model.nq :]
+        State.of(state, model.nq).put_into(data)
         mujoco.mj_forward(model, data)
         hand = data.site("gripper0_grip_site")
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, hand.id, moving, 0)

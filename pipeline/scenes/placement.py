@@ -17,7 +17,7 @@ from pipeline.libero.arenas import ARENAS
 from pipeline.libero.bddl import Bddl
 from pipeline.libero.carried import definition_of
 from pipeline.scenes.agent_view import AgentView
-from pipeline.scenes.compiled import CompiledScene, physics_to_read, simulate_held
+from pipeline.scenes.compiled import CompiledScene, compile_for_physics, simulate_held
 from pipeline.scenes.swept_path import SweptPath
 from pipeline.types import Demo, Floats, RollOut, Scene, State
 
@@ -128,7 +128,7 @@ class _Placement:
         self.model_xml = _with(scene.model_xml, objects, names)
         self._state, self._states, self._objects = scene.state, states, objects
         self._parked = np.array([[50.0 + 5 * number, 0.0, 50.0, 1.0, 0.0, 0.0, 0.0] for number in range(len(names))])
-        model = physics_to_read(self.model_xml)
+        model = compile_for_physics(self.model_xml)
         self._old_nq = model.nq - 7 * len(names)
         self._scene = CompiledScene(Scene(self.model_xml, self.state_with(states[0], self._parked)))
         self._added = [model.body(name).id for name in names]

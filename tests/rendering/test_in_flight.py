@@ -19,7 +19,7 @@ from pipeline.rendering.render import frames_of_steps
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.in_flight import BUFFERS, InFlightDrawing
 from pipeline.rendering.software.layers import LayersDrawing
-from pipeline.scenes.compiled import compiled
+from pipeline.scenes.compiled import compile_model
 from pipeline.seeding import rng
 from pipeline.types import Frame, Task, Trajectory
 
@@ -64,7 +64,7 @@ def test_steps_in_flight_are_yielded_in_order_with_the_noise_of_their_step(
     streams = [Stream("image", (moved, noise)), Stream("wrist_image", (moved,))]
 
     def steps_by(drawing_kind: type[PlainDrawing]) -> list[list[Frame]]:
-        model = compiled(trajectory.model_xml)
+        model = compile_model(trajectory.model_xml)
         with closing(Renderer(model, drawing_kind(model))) as renderer:
             return list(frames_of_steps(renderer, trajectory, streams))
 

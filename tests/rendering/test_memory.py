@@ -12,14 +12,14 @@ from pipeline.compute.workers import VARIABLES
 COMPILE = """
 import sys
 from pathlib import Path
-from pipeline.scenes.compiled import compiled
+from pipeline.scenes.compiled import compile_model
 
 def own_mb():
     lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
     return sum(int(line.split()[1]) for line in lines if line.startswith("Anonymous:")) / 1024
 
 before_mb = own_mb()
-model = compiled(Path(sys.argv[1]).read_text())
+model = compile_model(Path(sys.argv[1]).read_text())
 print(own_mb() - before_mb - model.nbuffer / 2**20)
 """
 
