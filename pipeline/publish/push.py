@@ -26,12 +26,21 @@ from pipeline.formats.base import Format
 from pipeline.generated import read_record, unchanged
 from pipeline.grouping import grouped
 from pipeline.publish.card import CHECKSUMS, REPOSITORY
-from pipeline.publish.repository import UPLOAD, Content, LastUpload, Repository, content_of, deletions, files_of, read
+from pipeline.publish.repository import (
+    UPLOAD,
+    Checksums,
+    LastUpload,
+    Repository,
+    compute_checksums,
+    deletions,
+    files_of,
+    read,
+)
 from pipeline.run.export import OFT_STATISTICS
 from pipeline.run.layout import CARD, FINETUNE
 from pipeline.run.run import Run
 
-FAILURES = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
+UPLOAD_ERRORS = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
 """Errors of an upload. Only huggingface-hub before version 1 has a ``XetError``; only later versions use httpx."""
 
 
@@ -130,7 +139,7 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
     try:
         name = _full_name(api, repository)
         there = read(api, name)
-    except FAILURES as error:
+    except UPLOAD_ERRORS as error:
         return f"the content of {repository} and its deleted files are unknown: {' '.join(str(error).split())}"
     if there is None:
         return f"{name} does not exist or is hidden from your token: it would be created"
@@ -199,7 +208,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
             api.create_tag(repository, tag=upload.tag, repo_type="dataset")
-    except FAILURES as error:
+    except UPLOAD_ERRORS as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url
 
@@ -231,15 +240,15 @@ def _contents(upload: Upload, repository: str) -> tuple[dict[str, Path | bytes],
     contents: dict[str, Path | bytes] = dict(upload.dataset)
     for path, file in upload.others.items():
         contents[path] = file.read_bytes()
-    checksums: dict[str, Content] = {}
+    checksums: dict[str, Checksums] = {}
     for path, content in contents.items():
-        checksums[path] = content_of(content)
+        checksums[path] = compute_checksums(content)
         if checksums[path].sha256 != upload.sha256[path]:
             raise PipelineError(
                 "the file has changed since it was checked", where=upload.files[path], remedy="run the command again"
             )
     card = upload.files["README.md"].read_text().replace(REPOSITORY, repository).encode()
-    contents["README.md"], checksums["README.md"] = card, content_of(card)
+    contents["README.md"], checksums["README.md"] = card, compute_checksums(card)
     return contents, LastUpload(run=upload.run, format=upload.format, files=dict(sorted(checksums.items())))
 
 

@@ -24,7 +24,7 @@ MAX_NAMED = 20
 BLOCK_BYTES = 2**20
 
 
-class Content(Frozen):
+class Checksums(Frozen):
     """Two checksums of a file: the hub states ``sha256`` for large files and ``blob`` for small files.
 
     Attributes:
@@ -51,7 +51,7 @@ class LastUpload(Frozen):
 
     run: str
     format: str
-    files: dict[str, Content]
+    files: dict[str, Checksums]
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Repository:
     upload: LastUpload | None
 
 
-def content_of(file: Path | bytes) -> Content:
+def compute_checksums(file: Path | bytes) -> Checksums:
     """Compute the checksums of a file, or of its content.
 
     Raises:
@@ -89,7 +89,7 @@ def content_of(file: Path | bytes) -> Content:
             while block := content.read(BLOCK_BYTES):
                 sha256.update(block)
                 blob.update(block)
-    return Content(sha256=sha256.hexdigest(), blob=blob.hexdigest())
+    return Checksums(sha256=sha256.hexdigest(), blob=blob.hexdigest())
 
 
 def read(api: HfApi, name: str) -> Repository | None:
