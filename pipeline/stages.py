@@ -95,14 +95,14 @@ def write_inputs(run: Run) -> None:
 
 def doctor(run: Run) -> None:
     """Check the machine and the installation against the needs of the run, and record the machine's trial."""
-    from pipeline.validation import doctor
+    from pipeline.validation import doctor as doctor_checks
 
     try:
         tried = finished.trial_memory(run, gl.choose().device).holds()
     except (PipelineError, PackageNotFoundError):
-        # The table of `doctor.run` reports missing packages.
+        # The table of `doctor_checks.run` reports missing packages.
         tried = False
-    failed = doctor.run(run, tried=tried)
+    failed = doctor_checks.run(run, tried=tried)
     if failed:
         raise PipelineError(
             f"the run cannot begin, because of failed checks: {', '.join(failed)}",
@@ -257,10 +257,10 @@ def validate(run: Run) -> None:
         file.touch()
         print(f"nothing has changed since the last checks, which found no errors: see {file}")
         return
-    from pipeline.validation.validate import validate
+    from pipeline.validation.validate import validate as validate_run
 
     with run.workers(renders=True) as workers:
-        report = validate(run, workers)
+        report = validate_run(run, workers)
     write_json(file, report)
     errors = {check: result["findings"] for check, result in report.items() if result["findings"]}
     if errors:
@@ -280,10 +280,11 @@ def write_recipe(run: Run) -> None:
     """Write the fine-tuning recipe, and the files that each policy's code needs to train on the datasets."""
     from pipeline.clients import recipe
 
-    export, content = run.config.export, run.config.render.content
-    probability = run.config.finetune.rewrite_probability
-    built = recipe.build(run.manifest_file, run.manifest, export, probability, content)
-    recipe.write(built, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
+    config = run.config
+    probability = config.finetune.rewrite_probability
+    built = recipe.build(run.manifest_file, run.manifest, config.export, probability, config.render.content)
+    folders = {dataset.name: dataset.folder for dataset in run.formats}
+    recipe.write(built, run.path(FINETUNE), config.export, folders)
     file = run.path(FINETUNE) / RECIPE
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
 
