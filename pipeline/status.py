@@ -114,7 +114,7 @@ def _steps(
         yield "replay", f"{len(needed)} trajectories are missing" + _of(generated_again, "trajectories")
     judged = selection.select(rows, verdicts, rejected)
     to_render = [row for row in rows if judged[row.episode_id].kept]
-    to_render += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
+    to_render += [row for row in outcome.list_failures(rows, judged, config.export) if row.episode_id not in rejected]
     missing = [row for row in to_render if not outcome.rendered(row, frames, config.render.content.views)]
     if missing:
         yield "render", f"the frames of {len(missing)} episodes are missing" + _of(generated_again, "files of frames")
@@ -149,7 +149,7 @@ def _outdated(run: Run, names: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 
 def _stale_datasets(run: Run) -> Iterator[tuple[str, str]]:
-    for dataset in (*run.formats, *(run.failure_formats if run.outcome.missed else ())):
+    for dataset in (*run.formats, *(run.failure_formats if run.outcome.failures else ())):
         episodes = export.episodes_of(dataset, run)
         changed_file = export.changed_file(dataset)
         if changed_file is not None:

@@ -81,7 +81,7 @@ def measure(run: Run, test: TestSet) -> list[Measure]:
     # Episodes are kept in a shuffled order, so that the first episodes of each axis are from many tasks.
     kept = [result.row_of[episode_id] for episode_id in result.kept]
     # Episodes that ``export.where`` leaves out have trajectories and frames, too.
-    made = [row for row in result.rows if result.verdicts[row.episode_id].reason in outcome.MADE]
+    made = [row for row in result.rows if result.verdicts[row.episode_id].reason in outcome.SUCCESS_REASONS]
     twins = {row.episode_id: row for row in made if row.role == "twin"}
     seen = _Seen(run, twins)
     sampled: list[Row] = []

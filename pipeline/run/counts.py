@@ -15,7 +15,7 @@ from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import HUMAN
 from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.planning.selection import NOT_NEEDED
-from pipeline.run.outcome import MADE
+from pipeline.run.outcome import SUCCESS_REASONS
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -108,7 +108,7 @@ def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
     """
     selected = [row for row in rows if row["chosen"]]
     planned = Counter(row["axis"] for row in selected if row["wanted"])
-    kept = Counter(row["axis"] for row in selected if row["reason"] in MADE)
+    kept = Counter(row["axis"] for row in selected if row["reason"] in SUCCESS_REASONS)
     wanted = {axis: planned[axis] for axis in named(selected, "axis")}
     if len(selected) == len(rows):
         wanted |= episodes
@@ -157,7 +157,7 @@ def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
     stored.
     """
     wanted = {row["twin_id"] for row in rows if row["kept"]}
-    stored = [row for row in rows if row["reason"] in MADE]
+    stored = [row for row in rows if row["reason"] in SUCCESS_REASONS]
     return {row["episode_id"]: row for row in stored if row["episode_id"] in wanted}
 
 

@@ -15,7 +15,7 @@ from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
 from pipeline.planning.streams import streams_of
 from pipeline.run import machine
-from pipeline.run.outcome import MISSED, rejections, rendered
+from pipeline.run.outcome import FAILURE_REASONS, rejections, rendered
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
@@ -136,7 +136,7 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
     judged = select(rows, verdict_of, not_rendered | rejected)
     trajectories: set[str] = set()
     streams: set[tuple[str, str]] = set()
-    failures = MISSED if config.export.failures else ()
+    failures = FAILURE_REASONS if config.export.failures else ()
     for row in rows:
         verdict = judged[row.episode_id]
         if verdict.reason == NOT_NEEDED:

@@ -203,7 +203,7 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     rewrites: dict[str, tuple[str, ...]] = {}
     outcome, language = run.outcome, run.config.plan.axes.language
     facts: dict[str, EpisodeFacts] = {}
-    for episode_id in shuffled(outcome.missed) if failures else outcome.kept:
+    for episode_id in shuffled(outcome.failures) if failures else outcome.kept:
         row = outcome.row_of[episode_id]
         rewrites[episode_id] = wordings(language, row.suite, row.task, row.perturbations)
         task = task_of(row.suite, row.task, row.perturbations)

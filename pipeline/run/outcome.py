@@ -22,11 +22,11 @@ from pipeline.types import Verdict
 LEFT_OUT = "left_out"
 """Reason of an episode that reached its goal and is in no dataset because ``export.where`` does not name it."""
 
-MADE = ("kept", LEFT_OUT)
+SUCCESS_REASONS = ("kept", LEFT_OUT)
 """Reasons of episodes whose trajectory and frames are stored."""
 
 
-MISSED = ("goal_not_reached", "goal_lost")
+FAILURE_REASONS = ("goal_not_reached", "goal_lost")
 """Reasons of failures: replays that were simulated to the end and missed their goal.
 
 Good demonstrations fail too: see the yields in docs/axes.md.
@@ -42,14 +42,14 @@ class Outcome:
         trajectories: trajectory id to its row in the table of replays.
         frames: trajectory id to the record of its stored frames.
         verdicts: episode id to verdict.
-        missed: ids of the failures to write, in the order of the plan; empty unless ``export.failures`` is set.
+        failures: ids of the failures to write, in the order of the plan; empty unless ``export.failures`` is set.
     """
 
     rows: Sequence[plan.Row]
     trajectories: Mapping[str, Mapping[str, Any]]
     frames: Mapping[str, StoredFrames]
     verdicts: Mapping[str, Verdict]
-    missed: Sequence[str] = ()
+    failures: Sequence[str] = ()
 
     @cached_property
     def kept(self) -> list[str]:
@@ -130,7 +130,7 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
         for row in rows:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
                 judged[row.episode_id] = Verdict(False, LEFT_OUT)
-    failures = [row for row in missed(rows, judged, config.export) if row.episode_id not in rejected]
+    failures = [row for row in list_failures(rows, judged, config.export) if row.episode_id not in rejected]
     kept = [row for row in rows if judged[row.episode_id].kept]
     not_rendered = [row for row in (*kept, *failures) if not rendered(row, stored_frames, views)]
     folders = dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)
@@ -138,11 +138,11 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
     return Outcome(rows, replays, stored_frames, judged, [row.episode_id for row in failures])
 
 
-def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
+def list_failures(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
     """List the failures that ``export`` requests, by the verdicts of ``selection.select``."""
     if not export.failures:
         return []
-    failures = [row for row in rows if judged[row.episode_id].reason in MISSED]
+    failures = [row for row in rows if judged[row.episode_id].reason in FAILURE_REASONS]
     where = export.where
     if where is None:
         return failures

@@ -13,7 +13,7 @@ from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row
 from pipeline.planning.selection import select
 from pipeline.planning.streams import Stream, streams_of
-from pipeline.run.outcome import MISSED, rejections
+from pipeline.run.outcome import FAILURE_REASONS, rejections
 from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, file_name, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -68,7 +68,7 @@ def render_plan(
     """
     device = gl.choose().device
     judged = verdicts_of(trajectories.rows(), rows, config.filter)
-    views, failures = config.render.content.views, MISSED if config.export.failures else ()
+    views, failures = config.render.content.views, FAILURE_REASONS if config.export.failures else ()
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in frames.refresh().items() if row["device"] == device}

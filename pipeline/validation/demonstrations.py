@@ -19,7 +19,7 @@ from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.libero.tasks import STEP_LIMITS, exceeds_step_limit, find_task, suites
 from pipeline.physics.environment import shared
 from pipeline.planning.plan import twins
-from pipeline.run.outcome import MISSED
+from pipeline.run.outcome import FAILURE_REASONS
 from pipeline.run.replay_job import ReplayJob
 from pipeline.testset.own_tasks import reject_test_tasks
 from pipeline.types import Task
@@ -135,7 +135,7 @@ class _FileJob:
             )
         chosen = self._chosen(index.entries)
         reasons = self._replayed(chosen, self.replay)
-        missing = [entry for entry, reason in reasons.items() if reason in MISSED]
+        missing = [entry for entry, reason in reasons.items() if reason in FAILURE_REASONS]
         all_miss = len(missing) == len(chosen) > 0
         faults += [self._not_replayed(entry, reasons[entry]) for entry in chosen if _is_refused(reasons[entry])]
         if all_miss:
@@ -239,7 +239,7 @@ class _FileJob:
 
 def _is_refused(reason: str) -> bool:
     """Return whether a demonstration has no verdict on its goal."""
-    return reason != "kept" and reason not in MISSED
+    return reason != "kept" and reason not in FAILURE_REASONS
 
 
 def _changed_replays(replay: ReplayConfig) -> Iterator[ReplayConfig]:

@@ -16,7 +16,7 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import encode
-from pipeline.physics.subtasks import subtasks as find_subtasks
+from pipeline.physics.subtasks import subtasks
 from pipeline.rendering.renderer import LastScene
 from pipeline.types import Frame
 from pipeline.validation.case import Case
@@ -38,7 +38,7 @@ def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(chosen.values())
 
 
-def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iterator[Fault]:
+def compare_frames(case: Case, render_config: RenderConfig, opened: LastScene) -> Iterator[Fault]:
     """Compare the first and the middle frame of every view with fresh renderings, which numpy rotates.
 
     If the same device renders, the stored frame must be the same file. On another device, and in the datasets, the
@@ -67,9 +67,9 @@ def rendered(case: Case, render_config: RenderConfig, opened: LastScene) -> Iter
                     yield case.finding(seen.dataset, what, expected)
 
 
-def subtasks(case: Case) -> Iterator[Fault]:
+def compare_subtasks(case: Case) -> Iterator[Fault]:
     """Compute the subtasks again from the states of the replay alone, and compare them with the stored ones."""
-    expected = find_subtasks(case.trajectory, case.task)
+    expected = subtasks(case.trajectory, case.task)
     if tuple(case.made.subtasks) != expected:
         yield case.finding("frames", f"subtasks {list(case.made.subtasks)}", list(expected))
 

@@ -36,7 +36,7 @@ from pipeline.run.layout import COUNTS, STATISTICS, WORK
 from pipeline.run.run import Run
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
-from pipeline.validation.rerender import rendered, subtasks, witnesses
+from pipeline.validation.rerender import compare_frames, compare_subtasks, witnesses
 
 WHOLE = 4
 """Number of re-rendered episodes of which all frames are decoded, for the statistics of their views."""
@@ -88,16 +88,9 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
         try:
             job = EpisodesJob(run, run.formats, cache, frozenset(witnesses(rows)))
             total.add(_datasets(job, kept, workers))
-            missed = set(run.outcome.missed) if run.config.export.failures else set()
-            if missed:
-                failures = run.failure_formats
-                places = registry.places(failures)
-                failed = {}
-                for row in rows:
-                    episode_id = row["episode_id"]
-                    if episode_id in missed:
-                        failed[episode_id] = row | places.get(episode_id, {})
-                job = EpisodesJob(run, failures, cache, frozenset([*failed][:1]), of_failures=True)
+            failed = _failed_rows(run)
+            if failed:
+                job = EpisodesJob(run, run.failure_formats, cache, frozenset([*failed][:1]), of_failures=True)
                 total.add(_datasets(job, failed, workers), within=f"{FAILURES}/")
         finally:
             scene_of_process().close()
@@ -105,6 +98,20 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
     for check, checked in total.checked.items():
         report[check] = {"checked": checked, "findings": [asdict(fault) for fault in total.findings[check]]}
     return report
+
+
+def _failed_rows(run: Run) -> dict[str, Row]:
+    """Map the id of each written failure to its row of the manifest, with its places in the datasets of failures."""
+    failures = set(run.outcome.failures) if run.config.export.failures else set()
+    if not failures:
+        return {}
+    places = registry.places(run.failure_formats)
+    failed: dict[str, Row] = {}
+    for row in run.manifest:
+        episode_id = row["episode_id"]
+        if episode_id in failures:
+            failed[episode_id] = row | places.get(episode_id, {})
+    return failed
 
 
 def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
@@ -117,9 +124,9 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
     changed = {fault.dataset for fault in total.findings["checksums"]}
     unchanged = [dataset for dataset in job.formats if dataset.name not in changed]
     # Workers open the datasets, because they read the episodes with the same packages later.
-    closed = workers(_closed, unchanged, "open")
-    total.note("readable", [fault for fault in closed if fault], 0)
-    job = replace(job, formats=[dataset for dataset, fault in zip(unchanged, closed, strict=True) if not fault])
+    open_faults = workers(_find_open_fault, unchanged, "open")
+    total.note("readable", [fault for fault in open_faults if fault], 0)
+    job = replace(job, formats=[dataset for dataset, fault in zip(unchanged, open_faults, strict=True) if not fault])
     # LeRobot, which takes longest, comes before RLDS; the other workers continue with the episodes.
     work: list[Callable[[], Results]] = []
     for dataset in reversed(job.formats):
@@ -136,7 +143,8 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
     return total
 
 
-def _closed(dataset: Format[Any]) -> Fault | None:
+def _find_open_fault(dataset: Format[Any]) -> Fault | None:
+    """Open a dataset, and return the fault if it cannot be opened."""
     try:
         dataset.open()
     except PipelineError as error:
@@ -159,7 +167,7 @@ def _counts(run: Run) -> Iterator[Fault]:
     quotas = grouped(((row["axis"], row["suite"], row["task"]), row) for row in rows)
     for (axis, suite, task), members in quotas.items():
         wanted = sum(row["wanted"] for row in members)
-        kept = sum(row["reason"] in outcome.MADE for row in members)
+        kept = sum(row["reason"] in outcome.SUCCESS_REASONS for row in members)
         left = any(row["reason"] in (selection.NOT_NEEDED, selection.NOT_REPLAYED) for row in members)
         if kept > wanted or (kept < wanted and left):
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
@@ -265,5 +273,5 @@ class EpisodesJob:
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:
-            results.note("rendered", rendered(case, self.run.config.render, scene_of_process()))
-            results.note("subtasks", subtasks(case))
+            results.note("rendered", compare_frames(case, self.run.config.render, scene_of_process()))
+            results.note("subtasks", compare_subtasks(case))

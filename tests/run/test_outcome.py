@@ -16,7 +16,7 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
-from pipeline.run.outcome import Outcome, missed
+from pipeline.run.outcome import Outcome, list_failures
 from pipeline.stores.frame_store import StoredFrames
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Subtask, Verdict
@@ -91,7 +91,7 @@ def test_failures_are_those_that_missed_their_goal_and_are_asked_for(run: Outcom
     judged = {row.episode_id: Verdict(False, reason) for row, reason in zip(run.rows, reasons, strict=True)}
 
     def asked(**export: Any) -> list[str]:
-        return [row.axis for row in missed(run.rows, judged, ExportConfig(**export))]
+        return [row.axis for row in list_failures(run.rows, judged, ExportConfig(**export))]
 
     assert asked() == []
     assert asked(failures=True) == ["noise", "robot"]
