@@ -50,6 +50,7 @@ from pipeline.run.layout import (
 from pipeline.run.outcome import outdated, rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
+from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
 from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.testset import benchmark
@@ -234,7 +235,7 @@ def write_manifest(run: Run) -> None:
         registry.places(run.formats),
         registry.columns(),
         config.export.where,
-        lambda row: export.wordings(config.plan.axes.language, row.suite, row.task, row.perturbations),
+        lambda row: list_episode_rewrites(config.plan.axes.language, row.suite, row.task, row.perturbations),
     )
     manifest.write(table, run.manifest_file, manifest.Settings.of(config))
 

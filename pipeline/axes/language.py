@@ -156,7 +156,7 @@ class LanguageAxis(Axis):
         rewrites = list_rewrites(task, self.components, self.levels, self.bank)
         return rewrites[place % len(rewrites)]
 
-    def wordings(self, task: Task, test: TestSet, *, other_objects: bool = False) -> tuple[str, ...]:
+    def list_clear_rewrites(self, task: Task, test: TestSet, *, other_objects: bool = False) -> tuple[str, ...]:
         """List the rewrites of a task that keep their clearance to test instructions.
 
         The result is empty if no bank has rewrites of the task.

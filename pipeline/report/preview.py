@@ -283,7 +283,7 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     tiles = [Tile(Image.fromarray(stage.frames(["image"])[0]), f"clean twin: {demo.task.instruction}")]
     for name in AXES:
         axis = configured(name, config)
-        without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, test)
+        without_rewrites = isinstance(axis, LanguageAxis) and not axis.list_clear_rewrites(demo.task, test)
         if axis.applies(demo.task) and not without_rewrites:
             drawn = variants(name, axis, demo, config.plan.seed, test)
             tiles.append(_typical(stage, drawn) if drawn else _nothing_drawn(name))

@@ -11,13 +11,12 @@ import re
 from collections import Counter
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.axes import from_json, task_of
-from pipeline.axes.language import LanguageAxis
+from pipeline.axes import task_of
 from pipeline.compute.pool import Workers
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
@@ -38,10 +37,9 @@ from pipeline.identity import ALLOW, REMAKE, reject_unasked
 from pipeline.record import Basis
 from pipeline.run.layout import DATASETS, WORK
 from pipeline.run.outcome import shuffled
+from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
 from pipeline.seeding import digest
-from pipeline.testset import benchmark
-from pipeline.types import Task
 
 AnyFormat = Format[Any]
 
@@ -205,7 +203,7 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     facts: dict[str, EpisodeFacts] = {}
     for episode_id in shuffled(outcome.failures) if failures else outcome.kept:
         row = outcome.row_of[episode_id]
-        rewrites[episode_id] = wordings(language, row.suite, row.task, row.perturbations)
+        rewrites[episode_id] = list_episode_rewrites(language, row.suite, row.task, row.perturbations)
         task = task_of(row.suite, row.task, row.perturbations)
         facts[episode_id] = EpisodeFacts(
             row.suite,
@@ -218,26 +216,6 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
         )
     load = run.episodes(failures=failures, rewrites=rewrites, replays=target.stores_replay)
     return Episodes(facts, load)
-
-
-def wordings(axis: LanguageAxis | None, suite: str, task: str, perturbations: str) -> tuple[str, ...]:
-    """List the rewrites that a language axis may sample for an episode with these perturbations.
-
-    A plan never joins a rewrite with an added object that the rewrite names.
-
-    Args:
-        axis: `None` for the axis with default ranges.
-        perturbations: JSON list, as in the columns of the plan and the manifest.
-    """
-    changes = from_json(perturbations)
-    other_objects = any(change.changes_objects for change in changes)
-    texts = _wordings(axis or LanguageAxis(), task_of(suite, task, perturbations), other_objects=other_objects)
-    return tuple(text for text in texts if not any(change.named_in(text) for change in changes))
-
-
-@cache
-def _wordings(axis: LanguageAxis, task: Task, *, other_objects: bool) -> tuple[str, ...]:
-    return axis.wordings(task, benchmark.load(), other_objects=other_objects)
 
 
 def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:

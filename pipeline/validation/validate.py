@@ -31,8 +31,8 @@ from pipeline.rendering.renderer import scene_of_process
 from pipeline.run import outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.export import wordings
 from pipeline.run.layout import COUNTS, STATISTICS, WORK
+from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
@@ -235,7 +235,9 @@ class EpisodesJob:
         results, language = Results(), self.run.config.plan.axes.language
         rewrites = {}
         for row in rows:
-            rewrites[row["episode_id"]] = wordings(language, row["suite"], row["task"], row["perturbations"])
+            rewrites[row["episode_id"]] = list_episode_rewrites(
+                language, row["suite"], row["task"], row["perturbations"]
+            )
         load = self.run.episodes(failures=self.of_failures, rewrites=rewrites)
         for row in rows:
             self._check(row, load, results)

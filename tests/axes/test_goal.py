@@ -221,12 +221,12 @@ def test_beside_the_axis_goal_every_rewrite_names_its_things() -> None:
     """A description such as this one holds in the task's own scene, which has no milk."""
     riddle, test = "find the only thing here that you would pour into a glass and drink", benchmark.load()
     juice = find_task("libero_object", f"{PICK}orange_juice{BASKET}")
-    assert any(riddle in text for text in LanguageAxis().wordings(juice, test))
+    assert any(riddle in text for text in LanguageAxis().list_clear_rewrites(juice, test))
     for suite in TESTED_SUITES:
         for pair in usable(suite):
             bank = load_bank()[pair.task.suite][pair.task.name]
             named = {text for component in ("distraction", "paraphrase") for text in bank[component]}
-            wordings = LanguageAxis().wordings(pair.played, test, other_objects=True)
+            wordings = LanguageAxis().list_clear_rewrites(pair.played, test, other_objects=True)
             assert {*wordings, *LanguageAxis().restrict_for([GoalAxis()]).entries(pair.played)} <= named
             assert len(wordings) > 10
 

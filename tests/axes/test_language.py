@@ -281,20 +281,20 @@ def test_a_further_bank_joins_the_shipped_one(tmp_path: Path) -> None:
 def test_wordings_are_a_tasks_own_without_the_benchmarks(tmp_path: Path, test: TestSet) -> None:
     for known in TASKS:
         listed = {text for texts in load_bank()[known.suite][known.name].values() for text in texts}
-        assert set(LanguageAxis().wordings(known, test)) == listed
+        assert set(LanguageAxis().list_clear_rewrites(known, test)) == listed
         named = {text for one in NAMED for text in load_bank()[known.suite][known.name][one]}
-        assert set(LanguageAxis().wordings(known, test, other_objects=True)) == named
+        assert set(LanguageAxis().list_clear_rewrites(known, test, other_objects=True)) == named
     known, bank = TASKS[0], tmp_path / "bank.yaml"
     texts = [str(tested.parameters["text"]) for tested in test.on(known, "language")]
     tested = next(text for text in texts if lint(text, known, "distraction") is None)
     bank.write_text(yaml.safe_dump({known.suite: {known.name: {"distraction": [tested]}}}))
     assert tested in {card.text for card in list_rewrites(known, bank=bank)}
-    assert {*LanguageAxis(bank=bank).wordings(known, test)} == {*LanguageAxis().wordings(known, test)}
+    assert {*LanguageAxis(bank=bank).list_clear_rewrites(known, test)} == {*LanguageAxis().list_clear_rewrites(known, test)}
 
 
 def test_a_task_without_rewrites_has_no_wordings(test: TestSet) -> None:
     known = find_task("libero_90", "KITCHEN_SCENE6_close_the_microwave")
-    assert LanguageAxis().wordings(known, test) == ()
+    assert LanguageAxis().list_clear_rewrites(known, test) == ()
 
 
 def test_of_a_wording_in_both_banks_and_two_classes_the_first_counts(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from pipeline.episode_schema import check, labels_of
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Format
 from pipeline.formats.read_back import Copy, Fault
-from pipeline.run.export import wordings
+from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.types import Episode, Subtask
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
@@ -114,7 +114,9 @@ def test_no_rewrite_names_an_added_object(task: str, name: str, category: str, w
     added = {"name": name, "category": category, "sha256": "0" * 64, "licence": "MIT", "attribution": ""}
     layout = {"axis": "layout", "component": "objects", "level": 1, "objects": [added], "seed": 1}
     milk = {**layout, "objects": [{**added, "category": "milk"}]}
-    kept, others = (wordings(None, "libero_object", task, json.dumps([change])) for change in (layout, milk))
+    kept, others = (
+        list_episode_rewrites(None, "libero_object", task, json.dumps([change])) for change in (layout, milk)
+    )
     naming = [text for text in others if word in text.split()]
     assert naming
     assert [text for text in others if text not in naming] == list(kept)
