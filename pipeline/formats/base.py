@@ -288,7 +288,7 @@ class Format(ABC, Generic[Options]):
         """
 
     @abstractmethod
-    def read(self, row: Row, cache: Path) -> Copy | None:
+    def read(self, row: Row) -> Copy | None:
         """Read an episode, wherever the dataset has it; ``None`` when the dataset does not have it.
 
         Raises:

@@ -118,7 +118,7 @@ class Rlds(Format[RldsConfig]):
 
         return rlds_read.check(self.folder, kept, self.content, self.options.validation)
 
-    def read(self, row: Row, cache: Path) -> Copy | None:
+    def read(self, row: Row) -> Copy | None:
         from pipeline.formats import rlds_read
 
         return rlds_read.read(self.folder, row, self.content)

@@ -220,7 +220,7 @@ class EpisodesJob:
 
     Attributes:
         formats: the datasets that can be opened.
-        cache: folder for temporary files of the readers.
+        cache: folder for temporary files of the checks of whole datasets.
         witnesses: ids of the episodes to render again.
         of_failures: True if the episodes missed their goal.
     """
@@ -249,7 +249,7 @@ class EpisodesJob:
         results.note("readable", [])
         for dataset in self.formats:
             try:
-                copy = dataset.read(row, self.cache)
+                copy = dataset.read(row)
             except PipelineError as error:
                 unreadable = Fault(dataset.name, episode_id, str(error), "an episode that can be read")
                 results.note("readable", [unreadable], 0)

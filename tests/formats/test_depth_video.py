@@ -138,7 +138,7 @@ def test_the_bytes_name_no_processor(dataset: LeRobot) -> None:
 
 
 def copied(dataset: LeRobot, episode_id: str) -> Copy:
-    copy = dataset.read({"episode_id": episode_id}, Path())
+    copy = dataset.read({"episode_id": episode_id})
     assert copy is not None
     return copy
 
@@ -204,7 +204,7 @@ def test_a_cut_video_is_found(dataset: LeRobot, tmp_path: Path) -> None:
     (file, *_) = sorted((spoiled.root / "videos" / COLUMNS["image"]).rglob("*.mp4"))
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(PipelineError, match=r"LeRobot v3\.0"):
-        spoiled.read({"episode_id": IDS[0]}, tmp_path)
+        spoiled.read({"episode_id": IDS[0]})
 
 
 def test_without_the_option_depth_is_text(tmp_path: Path) -> None:

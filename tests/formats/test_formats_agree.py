@@ -91,7 +91,7 @@ rows = {}
 for name in IDS:
     told = {"episode_id": name, "demo_id": name, "suite": "synthetic", "steps": 1}
     rows[name] = {**made.record().places[name], **told}
-assert all(made.read(row, folder) for row in rows.values())
+assert all(made.read(row) for row in rows.values())
 list(made.check(rows, folder))
 print(sorted({"torch", "tensorflow", "lerobot"} & sys.modules.keys()))
 """
@@ -117,7 +117,7 @@ def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
     rows = {name: {**rlds.record().places[name], "episode_id": name, "demo_id": name} for name in IDS}
     for episode_id, row in rows.items():
         source = with_extras(episode_id)
-        for copy in (rlds.read(row, tmp_path / "cache"), lerobot_set.read(row, tmp_path / "cache")):
+        for copy in (rlds.read(row), lerobot_set.read(row)):
             assert copy is not None
             assert copy.episode.object_poses is not None
             np.testing.assert_array_equal(copy.episode.object_poses, source.object_poses)

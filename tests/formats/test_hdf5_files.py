@@ -162,7 +162,7 @@ def test_rewrites_subtasks_and_a_missed_goal_are_stored(tmp_path: Path) -> None:
         assert not demo.attrs["success"]
         assert demo["rewards"][()].sum() == 0
         assert demo["dones"][()].sum() == 1
-    copy = target.read({"episode_id": IDS[2]}, tmp_path)
+    copy = target.read({"episode_id": IDS[2]})
     assert copy is not None
     assert (copy.episode.subtasks, copy.episode.rewrites) == (subtasks, rewrites)
 
@@ -189,7 +189,7 @@ def test_validation_episodes_are_in_files_of_their_own(tmp_path: Path) -> None:
     assert sorted(files(target.folder)) == [FILE, f"val/{FILE}"]
     rows = {one: {**row(one), "demo_id": facts.demo, "demo_origin_sha256": facts.demo} for one, facts in known.items()}
     assert list(target.check(rows, tmp_path)) == []
-    copies = [target.read(rows[one], tmp_path) for one in IDS]
+    copies = [target.read(rows[one]) for one in IDS]
     assert sorted(copy.train for copy in copies if copy) == [False, False, True, True, True, True]
 
 
@@ -206,7 +206,7 @@ def faults(target: Hdf5, source: Callable[[str], Episode] = episode) -> Mapping[
     for name, fault in target.check({one: {**rows[one], "demo_id": one} for one in IDS}, target.data):
         found.setdefault(name, []).append(fault.what)
     made = source(IDS[0])
-    copy = target.read(rows[IDS[0]], target.data)
+    copy = target.read(rows[IDS[0]])
     if copy is None:
         return {**found, "missing": [IDS[0]]}
     replay = made.replay
@@ -306,4 +306,4 @@ def test_an_attribute_that_is_lost_is_named(written: Hdf5) -> None:
         del file["data/demo_0"].attrs["start_state"]
     wanted: Row = row(IDS[0])
     with pytest.raises(PipelineError, match=r"(?s)data/demo_0.*start_state"):
-        written.read(wanted, written.data)
+        written.read(wanted)

@@ -36,7 +36,7 @@ def test_each_format_returns_the_labels_of_each_episode(write: Callable[[Path], 
     places = target.record().places
     for episode_id in IDS:
         row = {**places.get(episode_id, {}), "episode_id": episode_id, "demo_id": episode_id}
-        copy = target.read(row, tmp_path)
+        copy = target.read(row)
         assert copy is not None
         expected = ((), ()) if episode_id == WITHOUT_LABELS else (SUBTASKS, REWRITES)
         assert (tuple(copy.episode.subtasks), tuple(copy.episode.rewrites)) == expected

@@ -42,7 +42,7 @@ def test_policies_train_on_the_chosen_actions(choice: str, trained: str, other: 
     }
     assert [fault.what for _, fault in target.check(rows, tmp_path / "cache")] == []
     for source in written:
-        copy = target.read(rows[source.episode_id], tmp_path / "cache")
+        copy = target.read(rows[source.episode_id])
         assert copy is not None
         np.testing.assert_array_equal(copy.episode.action, source.action)
         np.testing.assert_array_equal(copy.episode.action_absolute, source.action_absolute)

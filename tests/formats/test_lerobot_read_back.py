@@ -47,12 +47,12 @@ def put(file: Path, column: str, value: Any) -> None:
 @pytest.mark.parametrize("version", WITH_IMAGES)
 def test_every_image_file_is_read_back(version: str, tmp_path: Path) -> None:
     target, source = WITH_IMAGES[version](tmp_path), episode(IDS[-1])
-    copy = target.read(source.provenance, tmp_path)
+    copy = target.read(source.provenance)
     assert copy is not None
     assert copy.episode.frames == source.frames
     other = {"bytes": source.frames["wrist_image"][0], "path": None}
     put(max(target.folder.glob("*/data/**/*.parquet")), target.keys["wrist_image"], other)
-    copy = target.read(source.provenance, tmp_path)
+    copy = target.read(source.provenance)
     assert copy is not None
     (fault,) = CHECKS["jpeg"](Case({}, source, replay_of(source), [copy], None))
     assert fault.what == f"wrist_image differs at 1 steps, first at {len(source) - 1}"
@@ -70,7 +70,7 @@ def stored_otherwise(text: str) -> str:
 def of_first(target: LeRobot | LeRobotV21) -> list[Fault]:
     """What is found in the statistics of the first episode, as ``validate`` finds it."""
     source = episode(IDS[0])
-    copy = target.read(source.provenance, target.data)
+    copy = target.read(source.provenance)
     assert copy is not None
     return list(CHECKS["statistics"](Case({}, source, replay_of(source), [copy], None)))
 
@@ -91,6 +91,6 @@ def test_ids_and_numbers_of_steps_and_statistics_are_read(version: str, tmp_path
     for column, value in (("episode_id", IDS[0]), ("index", 0), ("episode_index", 0)):
         put(data, column, value)
         with pytest.raises(PipelineError, match=f"by {column}, these are not the {len(episode(IDS[-1]))} steps"):
-            target.read(kept[IDS[-1]], tmp_path)
+            target.read(kept[IDS[-1]])
         data.write_bytes(whole)
-    assert target.read(kept[IDS[-1]], tmp_path) is not None
+    assert target.read(kept[IDS[-1]]) is not None

@@ -94,7 +94,7 @@ def test_v21_does_not_depend_on_workers_and_keeps_extras(convention: str, tmp_pa
     kept = {episode_id: {"episode_id": episode_id, "demo_id": episode_id} for episode_id in IDS}
     assert list(two.check(kept, tmp_path)) == []
     for episode_id in IDS:
-        source, copy = with_extras(episode_id), two.read(kept[episode_id], tmp_path)
+        source, copy = with_extras(episode_id), two.read(kept[episode_id])
         assert copy is not None
         np.testing.assert_array_equal(copy.episode.action, source.action)
         np.testing.assert_array_equal(copy.episode.object_poses, source.object_poses)

@@ -257,7 +257,7 @@ def cases(data: Path) -> list[Case]:
     for one in formats:
         for episode_id, place in one.record().places.items():
             places.setdefault(episode_id, dict(rows[episode_id])).update(place)
-    read = {episode_id: [one.read(row, data / "cache") for one in formats] for episode_id, row in places.items()}
+    read = {episode_id: [one.read(row) for one in formats] for episode_id, row in places.items()}
     return [
         Case(
             row=row,

@@ -64,7 +64,7 @@ def found(target: Format[Any], folder: Path) -> list[str]:
 
 def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path) -> list[Fault]:
     source = episode(IDS[0])
-    copy = target.read(kept[IDS[0]], folder)
+    copy = target.read(kept[IDS[0]])
     assert copy is not None
     none = np.zeros((0, 0), np.float32)
     replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), np.zeros(0), np.zeros(0), none, Verdict(True, "kept"))

@@ -89,7 +89,7 @@ class Hdf5(Format[Hdf5Config]):
 
         return read.check(self.folder, kept, self.content, self.options.validation)
 
-    def read(self, row: Row, cache: Path) -> Copy | None:
+    def read(self, row: Row) -> Copy | None:
         from pipeline.formats.hdf5 import read
 
         return read.read(self.folder, row["episode_id"], self.content)

@@ -202,7 +202,7 @@ class LeRobot(Format[LeRobotConfig]):
 
         return check.check(self.root, cache, kept, self._convention, self.content, self.options.validation)
 
-    def read(self, row: Row, cache: Path) -> Copy | None:
+    def read(self, row: Row) -> Copy | None:
         from pipeline.formats.lerobot import read
 
         return read.read(self.root, row["episode_id"], self.content, self._convention)
@@ -345,7 +345,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
         return check.check_v21(self.folder, kept, self.convention, self.content, self.options.validation)
 
-    def read(self, row: Row, cache: Path) -> Copy | None:
+    def read(self, row: Row) -> Copy | None:
         from pipeline.formats.lerobot import read
 
         return read.read_v21(self.folder, row["episode_id"], self.convention, self.content)
