@@ -364,8 +364,8 @@ class RenderPerturbation(Perturbation):
 
     Attributes:
         fields: arrays of the model that ``apply`` may write, a subset of ``FIELDS``; they are restored afterwards.
-        paints: true if it writes textures and nothing else.
-        sees_otherwise: true if it shows other surfaces: from another place, through another lens, or behind a
+        changes_only_textures: true if it writes textures and nothing else.
+        shows_other_surfaces: true if it shows other surfaces: from another place, through another lens, or behind a
             surface that was opaque.
         casts_shadows: true if lamps may cast shadows that LIBERO's own lamps do not cast; they take longer to render.
     """
@@ -374,8 +374,8 @@ class RenderPerturbation(Perturbation):
     can_hide: ClassVar[bool] = True
     fields: ClassVar[tuple[str, ...]] = ()
     casts_shadows: ClassVar[bool]
-    paints: ClassVar[bool]
-    sees_otherwise: ClassVar[bool]
+    changes_only_textures: ClassVar[bool]
+    shows_other_surfaces: ClassVar[bool]
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: object) -> None:
@@ -386,8 +386,8 @@ class RenderPerturbation(Perturbation):
                 "PhysicsPerturbation, which changes the scene before the replay"
             )
         cls.casts_shadows = "light_castshadow" in cls.fields
-        cls.paints = cls.fields == ("tex_data",)
-        cls.sees_otherwise = not {*CAMERA_FIELDS, *OPACITY_FIELDS}.isdisjoint(cls.fields)
+        cls.changes_only_textures = cls.fields == ("tex_data",)
+        cls.shows_other_surfaces = not {*CAMERA_FIELDS, *OPACITY_FIELDS}.isdisjoint(cls.fields)
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Write the change into the model's ``fields``."""

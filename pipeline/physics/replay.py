@@ -1,6 +1,7 @@
 """Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory with a verdict out.
 
-``roll_out`` and ``first_look`` return the states of a scene before it is replayed, for perturbations that need them.
+``roll_out`` returns the states of a scene before it is replayed, for perturbations that need them.
+``compute_settled_state`` returns the first of these states, for previews.
 """
 
 import sys
@@ -196,7 +197,7 @@ def at_reset(environment: Environment, demo: Demo, seed: int) -> Demo:
     return replace(demo, init_state=environment.state, states=None, model_xml=model_xml)
 
 
-def first_look(scene: Scene, task: Task, replay_config: ReplayConfig) -> Floats:
+def compute_settled_state(scene: Scene, task: Task, replay_config: ReplayConfig) -> Floats:
     """Return the state (S,) in which ``scene`` has settled, which the first frame of a replay shows.
 
     Raises:

@@ -36,7 +36,7 @@ class Stream:
     @property
     def geometry(self) -> Stream:
         """Stream under the changes of visible surfaces alone; streams that share it share their geometry."""
-        return Stream(self.view, tuple(change for change in self.changes if change.sees_otherwise))
+        return Stream(self.view, tuple(change for change in self.changes if change.shows_other_surfaces))
 
     def scene(self, textures: bool = True) -> str:
         """Return a key that streams of one scene share.
@@ -44,7 +44,7 @@ class Stream:
         Args:
             textures: true if scenes with different textures count as different scenes.
         """
-        return to_json([change for change in self.changes if textures or not change.paints])
+        return to_json([change for change in self.changes if textures or not change.changes_only_textures])
 
 
 @lru_cache(maxsize=65536)

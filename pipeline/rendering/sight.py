@@ -120,7 +120,7 @@ class FirstFrame:
                 if exposure_fault:
                     faults.append(exposure_fault)
         if CAMERA in cameras:
-            moved = any(change.sees_otherwise for change in changes)
+            moved = any(change.shows_other_surfaces for change in changes)
             sight = Sight.of(self._renderer, self._task, self._hand_m) if moved else self._original
             faults += sight.faults(self._original, _most_outside(changes))
         return faults[0] if faults else None

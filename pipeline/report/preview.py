@@ -24,7 +24,7 @@ from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import at_reset, first_look, replay, roll_out
+from pipeline.physics.replay import at_reset, compute_settled_state, replay, roll_out
 from pipeline.planning.plan import Sampler
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
@@ -75,7 +75,7 @@ class Stage:
         renderer = self.opened.renderer(scene.model_xml)
         push = scene.push
         if push is None:
-            state = first_look(scene, demo.task, self.replay)
+            state = compute_settled_state(scene, demo.task, self.replay)
         else:
             states = roll_out(scene, demo, self.replay)
             state = states[min(push.first_step + push.steps + AFTER_PUSH_STEPS, len(states) - 1)]

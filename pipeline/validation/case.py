@@ -19,8 +19,8 @@ from pipeline.types import Episode, Frame, Task, Trajectory
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A view of an episode.
+class ShownView:
+    """Sampled frames of a view of an episode, in the store or in a dataset.
 
     Attributes:
         frames: sampled step to its frame, (H, W, 3).
@@ -74,16 +74,16 @@ class Case:
     @cached_property
     def sampled_levels(self) -> dict[str, NDArray[np.int64]]:
         """Histogram of levels in each channel of the sampled frames, (3, 256), by view."""
-        return {view: _levels(seen.frames.values()) for view, seen in self.stored.items()}
+        return {view: _levels(shown_view.frames.values()) for view, shown_view in self.stored.items()}
 
     @cached_property
-    def stored(self) -> dict[str, Seen]:
+    def stored(self) -> dict[str, ShownView]:
         """Sampled frames of the store, by view."""
         steps = sampled(len(self.made))
         views = {}
         for view, files in self.made.frames.items():
             frames = {step: decode(files[step]) for step in steps}
-            views[view] = Seen("frames", view, frames)
+            views[view] = ShownView("frames", view, frames)
         return views
 
     @cached_property
@@ -102,7 +102,7 @@ class Case:
         return np.stack([decode_exactly(file) for file in files]) * SCHEMA.depth.unit_m
 
     @cached_property
-    def seen(self) -> list[Seen]:
+    def shown_views(self) -> list[ShownView]:
         """Views of the store, and views of the copies whose files differ from the store's."""
         views = [*self.stored.values()]
         for copy in self.whole:
@@ -113,7 +113,7 @@ class Case:
                 # ``jpeg`` reports files that cannot be decoded, and ``format`` reports missing views.
                 with suppress(ValueError, TypeError, LookupError, cv2.error):
                     frames = {step: copy.frame(view, step) for step in stored.frames}
-                    views.append(Seen(copy.dataset, view, frames, video=not files))
+                    views.append(ShownView(copy.dataset, view, frames, video=not files))
         return views
 
     @cached_property

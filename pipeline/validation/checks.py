@@ -352,37 +352,43 @@ def _goal_places(case: Case) -> list[int]:
 
 def video(case: Case) -> Iterator[Fault]:
     """Check that frames of videos are within ``VIDEO_PSNR_DB`` and ``COLOURS_OFF`` of the stored frames."""
-    for seen in case.seen:
-        stored, within = case.stored[seen.view], f"{VIDEO_PSNR_DB} or more"
-        for step, frame in seen.frames.items() if seen.video else ():
-            name = f"{seen.view} of step {step}"
-            psnr_db = cv2.PSNR(seen.grey[step], stored.grey[step])
+    for shown_view in case.shown_views:
+        stored, within = case.stored[shown_view.view], f"{VIDEO_PSNR_DB} or more"
+        for step, frame in shown_view.frames.items() if shown_view.video else ():
+            name = f"{shown_view.view} of step {step}"
+            psnr_db = cv2.PSNR(shown_view.grey[step], stored.grey[step])
             if psnr_db < VIDEO_PSNR_DB:
-                yield case.finding(seen.dataset, f"{name} has {psnr_db:.1f} dB", within)
+                yield case.finding(shown_view.dataset, f"{name} has {psnr_db:.1f} dB", within)
                 continue
             difference = _colours_off(frame, stored.frames[step])
             if difference > COLOURS_OFF:
-                yield case.finding(seen.dataset, f"{name} has other colours ({difference:.2f})", f"{COLOURS_OFF}")
+                yield case.finding(shown_view.dataset, f"{name} has other colours ({difference:.2f})", f"{COLOURS_OFF}")
 
 
 def cameras(case: Case) -> Iterator[Fault]:
     """Check that no view shows the picture of another camera."""
-    for seen in case.seen:
-        for step, frame in seen.grey.items():
-            for view in case.stored.keys() - {seen.view}:
+    for shown_view in case.shown_views:
+        for step, frame in shown_view.grey.items():
+            for view in case.stored.keys() - {shown_view.view}:
                 if cv2.PSNR(frame, case.stored[view].grey[step]) > VIDEO_PSNR_DB:
-                    yield case.finding(seen.dataset, f"{seen.view} of step {step} shows {view}", "its own camera")
+                    yield case.finding(
+                        shown_view.dataset, f"{shown_view.view} of step {step} shows {view}", "its own camera"
+                    )
 
 
 def alive(case: Case) -> Iterator[Fault]:
     """Check that no view has a blank frame or stays constant."""
-    for seen in case.seen:
-        first, *_ = frames = [*seen.frames.values()]
-        still_levels = STILL_LEVELS if seen.view in SCHEMA.views else FAR_STILL_LEVELS
+    for shown_view in case.shown_views:
+        first, *_ = frames = [*shown_view.frames.values()]
+        still_levels = STILL_LEVELS if shown_view.view in SCHEMA.views else FAR_STILL_LEVELS
         if min(cv2.meanStdDev(frame.reshape(-1))[1].item() for frame in frames) < BLANK_LEVELS:
-            yield case.finding(seen.dataset, f"{seen.view} has a blank frame", f"more than {BLANK_LEVELS} grey levels")
+            yield case.finding(
+                shown_view.dataset, f"{shown_view.view} has a blank frame", f"more than {BLANK_LEVELS} grey levels"
+            )
         elif max(cv2.norm(frame, first, cv2.NORM_L1) / frame.size for frame in frames) < still_levels:
-            yield case.finding(seen.dataset, f"{seen.view} is constant", "a camera that sees the robot move")
+            yield case.finding(
+                shown_view.dataset, f"{shown_view.view} is constant", "a camera that sees the robot move"
+            )
 
 
 def gripper(case: Case) -> Iterator[Fault]:

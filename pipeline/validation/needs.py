@@ -228,7 +228,7 @@ def _casts_shadows(kind: type[Perturbation]) -> bool:
 
 def _seen_otherwise(kind: type[Perturbation]) -> bool:
     """Return whether episodes have their own maps, because they show other surfaces or views than the clean twin."""
-    return issubclass(kind, PhysicsPerturbation) or (issubclass(kind, RenderPerturbation) and kind.sees_otherwise)
+    return issubclass(kind, PhysicsPerturbation) or (issubclass(kind, RenderPerturbation) and kind.shows_other_surfaces)
 
 
 def _exported(config: Config, amounts: Amounts) -> tuple[int, float]:

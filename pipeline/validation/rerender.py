@@ -53,18 +53,18 @@ def compare_frames(case: Case, render_config: RenderConfig, opened: LastScene) -
             stored = case.made.frames[view][step]
             again = encode(_turned(fresh[view]), render_config.jpeg_quality)
             same = exact and stored == again
-            for seen in case.seen:
-                if seen.view != view or (same and seen.dataset == "frames"):
+            for shown_view in case.shown_views:
+                if shown_view.view != view or (same and shown_view.dataset == "frames"):
                     continue
                 right = f"{name} turned by {SCHEMA.image_rotation_deg} degrees"
-                nearest, reached_db = _nearest(seen.frames[step], right, view, fresh, former.get(view))
+                nearest, reached_db = _nearest(shown_view.frames[step], right, view, fresh, former.get(view))
                 if nearest != right or reached_db < PSNR_DB:
                     what = f"{name} is nearest to {nearest}, {reached_db:.1f} dB"
-                    yield case.finding(seen.dataset, what, right)
-                elif exact and seen.dataset == "frames":
+                    yield case.finding(shown_view.dataset, what, right)
+                elif exact and shown_view.dataset == "frames":
                     what = f"{name} is another file than a fresh rendering, {reached_db:.1f} dB apart"
                     expected = f"the same file, because {case.row['gl_device']} rendered both"
-                    yield case.finding(seen.dataset, what, expected)
+                    yield case.finding(shown_view.dataset, what, expected)
 
 
 def compare_subtasks(case: Case) -> Iterator[Fault]:

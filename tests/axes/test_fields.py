@@ -138,7 +138,7 @@ def test_a_changed_field_shows_as_in_a_context_of_its_own(renderer: Renderer, pl
     with renderer.perturbed([change]):
         changed = frame(renderer)
         other = not all(map(np.array_equal, surfaces, renderer.surfaces("agentview")))
-        assert change.sees_otherwise or not other, "views share their geometry that see the same surfaces"
+        assert change.shows_other_surfaces or not other, "views share their geometry that see the same surfaces"
         assert np.array_equal(changed, plain.frame(renderer.model))
         assert not np.array_equal(changed, before), "the test shows nothing"
     assert np.array_equal(frame(renderer), before)
