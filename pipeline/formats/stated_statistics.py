@@ -1,4 +1,7 @@
-"""Comparison of the statistics that a dataset states of its columns with the columns; lerobot's, by their names."""
+"""Comparison of the statistics that a dataset states of its columns with the columns; lerobot's, by their names.
+
+This module shares no code with ``exact_statistics.py``, whose results it checks.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -9,8 +12,8 @@ from numpy.typing import NDArray
 FIGURES = ("count", "mean", "std", "min", "max")
 """lerobot's statistics."""
 
-QUANTILES = ("q01", "q10", "q50", "q90", "q99")
-"""Additional statistics of v3.0; pi0.5 normalises by them."""
+QUANTILE_NAMES = ("q01", "q10", "q50", "q90", "q99")
+"""Names of additional statistics of v3.0; pi0.5 normalises by them."""
 
 SAME_SHARE, SAME = 1e-4, 1e-6
 """Largest relative and absolute difference between stored statistics and those of the columns."""
@@ -117,7 +120,7 @@ def _of_levels(levels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
 
 def disordered(column: str, stored: Stored) -> Wrong:
     """Compare the order of the range and the quantiles."""
-    names = [name for name in ("min", *QUANTILES, "max") if name in stored]
+    names = [name for name in ("min", *QUANTILE_NAMES, "max") if name in stored]
     figures = np.array([np.ravel(stored[name]) for name in names])
     if (np.diff(figures, axis=0) < -SAME).any():
         yield f"{', '.join(names)} of {column} are not in order: {figures.tolist()}", "each at least the one before"

@@ -48,7 +48,7 @@ from pipeline.formats.lerobot.read import (
 from pipeline.formats.read_back import Fault, in_both_splits, sampled, unlike
 from pipeline.formats.stated_statistics import (
     FIGURES,
-    QUANTILES,
+    QUANTILE_NAMES,
     SAME,
     Stored,
     Wrong,
@@ -211,7 +211,7 @@ def _wrong_statistics(root: Path, convention: Convention, content: Content) -> I
     stored = json.loads((root / "meta" / "stats.json").read_text())
     yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(content))
     for column in convention.pictures(content).values():
-        names = [f"stats/{column}/{figure}" for figure in (*FIGURES, *QUANTILES)]
+        names = [f"stats/{column}/{figure}" for figure in (*FIGURES, *QUANTILE_NAMES)]
         tables = [pq.read_table(file, columns=names) for file in episode_files(root)]
         of_episodes = {}
         for name in names:
@@ -443,15 +443,15 @@ def _wrong_in_dataset(stored: Mapping[str, Stored], files: Sequence[Path], colum
     if stored.keys() != widths.keys():
         yield f"the statistics have the columns {sorted(stored)}", f"{sorted(widths)}"
     for column, width in widths.items():
-        yield from complete(column, stored.get(column, {}), (*FIGURES, *QUANTILES), width)
+        yield from complete(column, stored.get(column, {}), (*FIGURES, *QUANTILE_NAMES), width)
     for column, width in numbers.items():
-        if any(complete(column, stored.get(column, {}), (*FIGURES, *QUANTILES), width)):
+        if any(complete(column, stored.get(column, {}), (*FIGURES, *QUANTILE_NAMES), width)):
             continue
         for first in range(0, width, ENTRIES):
             entries = slice(first, first + ENTRIES)
             values = np.concatenate([read_matrix(file, column)[:, entries] for file in files])
             part = {name: value if name == "count" else value[entries] for name, value in stored[column].items()}
-            yield from wrong_numbers(column, part, values, QUANTILES)
+            yield from wrong_numbers(column, part, values, QUANTILE_NAMES)
 
 
 def _wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[Any]]) -> Wrong:
@@ -466,7 +466,7 @@ def _wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[An
         stored: its statistics over all frames.
         episodes: name to the statistics of all episodes, (episodes, channels), of the count (episodes, 1).
     """
-    if any(complete(column, stored, (*FIGURES, *QUANTILES), episodes["mean"].shape[1])):
+    if any(complete(column, stored, (*FIGURES, *QUANTILE_NAMES), episodes["mean"].shape[1])):
         return
     frames = episodes["count"]
     mean = (frames * episodes["mean"]).sum(axis=0) / frames.sum()
@@ -481,7 +481,7 @@ def _wrong_frames(column: str, stored: Stored, episodes: Mapping[str, NDArray[An
     for name, expected in wanted.items():
         yield from unlike_figures(f"{name} of {column}", np.ravel(stored[name]), expected)
     mean, std = wanted["mean"], wanted["std"]
-    for name in QUANTILES:
+    for name in QUANTILE_NAMES:
         levels, share = np.ravel(stored[name]), int(name[1:]) / 100
         least, most = mean - std * np.sqrt((1 - share) / share), mean + std * np.sqrt(share / (1 - share))
         if name in episodes:

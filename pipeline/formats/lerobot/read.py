@@ -33,7 +33,7 @@ from pipeline.formats.lerobot.columns import (
 )
 from pipeline.formats.lerobot.depth import PIXEL_FORMAT, metres_of
 from pipeline.formats.read_back import Copy, Statistics, sampled, subtasks_of
-from pipeline.formats.stated_statistics import QUANTILES
+from pipeline.formats.stated_statistics import QUANTILE_NAMES
 from pipeline.types import Episode, Geometry
 
 UNREADABLE = (
@@ -144,7 +144,7 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
             stored=_statistics(root, row),
             numbers={name: matrix(table, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
             views={view: spec.lerobot_key for view, spec in content.cameras.items()},
-            quantiles=QUANTILES,
+            quantiles=QUANTILE_NAMES,
             depth=depth_columns,
         ),
         depth_m={place: metres_of(each) for place, each in codes.items()},
