@@ -85,7 +85,7 @@ def _counts(
         kept = [row for row in of_axis if judged[row.episode_id].kept]
         planned = sum(row.wanted for row in of_axis)
         wanted = config.plan.episodes.get(axis, planned)
-        rendered = sum(outcome.rendered(row, frames, views) for row in kept)
+        rendered = sum(outcome.has_frames(row, frames, views) for row in kept)
         every.append((wanted, planned, len(kept), rendered))
         # The name of a combination may break after a +.
         table.add_row(axis.replace("+", "+ "), *map(str, every[-1]))
@@ -115,7 +115,7 @@ def _steps(
     judged = selection.select(rows, verdicts, rejected)
     to_render = [row for row in rows if judged[row.episode_id].kept]
     to_render += [row for row in outcome.list_failures(rows, judged, config.export) if row.episode_id not in rejected]
-    missing = [row for row in to_render if not outcome.rendered(row, frames, config.render.content.views)]
+    missing = [row for row in to_render if not outcome.has_frames(row, frames, config.render.content.views)]
     if missing:
         yield "render", f"the frames of {len(missing)} episodes are missing" + _of(generated_again, "files of frames")
     if needed or missing or why_planned is not None:

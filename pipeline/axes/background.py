@@ -138,7 +138,7 @@ class BackgroundPerturbation(RenderPerturbation):
         is_tested = any(_is_tested(covering, test) for covering in self.coverings)
         return np.full(len(test.on_axis("background")), 0.0 if is_tested else 1.0)
 
-    def apart(self, others: Sequence[BackgroundPerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[BackgroundPerturbation]) -> Floats:
         """Return 0 for perturbations that share an image with this one, 1 for the others (N,)."""
         images = self._images
         return np.array([float(images.isdisjoint(perturbation._images)) for perturbation in others])

@@ -142,7 +142,7 @@ class Perturbation(Frozen):
         """Seed of the reset of LIBERO's environment that starts the episode; ``None`` if it starts as recorded."""
         return None
 
-    def apart(self, others: Sequence[Self]) -> Floats:
+    def distances_to(self, others: Sequence[Self]) -> Floats:
         """Return the distances (N,) to N perturbations of this class, in the measure of ``distances``.
 
         A distance is NaN if the two cannot be compared. The default is 0 to an equal perturbation, else 1.

@@ -121,7 +121,7 @@ class CameraPerturbation(RenderPerturbation):
         cameras, places = _test_cameras(test)
         return self._angles_deg(cameras)[places]
 
-    def apart(self, others: Sequence[CameraPerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[CameraPerturbation]) -> Floats:
         """Return the distances (N,) to other cameras, for any tasks."""
         parameters = [perturbation._parameters() for perturbation in others]
         return self._angles_deg(_embed(np.array(parameters)))

@@ -88,7 +88,7 @@ class DisturbancePerturbation(PhysicsPerturbation):
         """Impulse (3,) of the push along the world's axes."""
         return np.array(self.wrench[:3]) * self.steps * STEP_S
 
-    def apart(self, others: Sequence[DisturbancePerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[DisturbancePerturbation]) -> Floats:
         """Return the distances (N,) to pushes that begin at the same step; NaN for pushes at another step."""
         apart_n_s = [float(np.linalg.norm(self.impulse_n_s - push.impulse_n_s)) for push in others]
         return np.where([self.first_step == push.first_step for push in others], apart_n_s, math.nan)

@@ -87,18 +87,18 @@ class LayoutPerturbation(PhysicsPerturbation):
         The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
         """
         tested = test.on(task, "layout", "scene")
-        return [self._apart_from(_plain(test_task.parameters["category"])) for test_task in tested]
+        return [self._distance_to(_plain(test_task.parameters["category"])) for test_task in tested]
 
-    def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[LayoutPerturbation]) -> Floats:
         """Return infinity for each perturbation that shares no category with this one, else 0 (N,)."""
-        return np.array([self._apart_from(perturbation._categories) for perturbation in others])
+        return np.array([self._distance_to(perturbation._categories) for perturbation in others])
 
     @property
     def _categories(self) -> set[str]:
         """Categories of the added objects."""
         return {added.category for added in self.objects}
 
-    def _apart_from(self, categories: Iterable[str]) -> float:
+    def _distance_to(self, categories: Iterable[str]) -> float:
         """Return infinity if no added object has one of ``categories``, else 0."""
         return math.inf if self._categories.isdisjoint(categories) else 0.0
 

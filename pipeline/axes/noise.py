@@ -74,7 +74,7 @@ class NoisePerturbation(PixelPerturbation):
         tested, severities = _tested(test, self.component, self.effect.strength[0])
         return np.abs(severities - self.severity(test)) if tested else severities
 
-    def apart(self, others: Sequence[NoisePerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[NoisePerturbation]) -> Floats:
         """Return the distances (N,) to perturbations of this component, on the scale of the benchmark's severities.
 
         A distance is NaN if the component differs.

@@ -167,7 +167,7 @@ class PosePerturbation(_PosePerturbation):
 
         The test tasks also move every other thing, so their scenes would differ from this one even at distance zero.
         """
-        return self._apart_m(_test_moves_m(test, task, self.moved))
+        return self._distances_m(_test_moves_m(test, task, self.moved))
 
     @property
     def shifts(self) -> Shifts:
@@ -178,11 +178,11 @@ class PosePerturbation(_PosePerturbation):
         """Return this change with the object's name in all tasks with the initial scene of ``task``."""
         return super().in_scene(task).model_copy(update={"moved": _scene_name(task, self.moved)})
 
-    def apart(self, others: Sequence[PosePerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[PosePerturbation]) -> Floats:
         """Return the distances (N,) to perturbations that move this object; NaN for those of another object."""
-        return self._apart_m([p.shifts_in_all[p.moved] if p.moved == self.moved else NOWHERE for p in others])
+        return self._distances_m([p.shifts_in_all[p.moved] if p.moved == self.moved else NOWHERE for p in others])
 
-    def _apart_m(self, moves_m: ArrayLike) -> Floats:
+    def _distances_m(self, moves_m: ArrayLike) -> Floats:
         """Return the distances (N,) to moves (N, 2) of this object."""
         return np.asarray(np.linalg.norm(np.subtract(moves_m, self.shifts_in_all[self.moved]), axis=1))
 
@@ -252,17 +252,17 @@ class ScenePerturbation(_PosePerturbation):
 
     def distances_on(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the test tasks, over all things that both move."""
-        return self._apart_m(lambda name: _test_moves_m(test, task, name))
+        return self._distances_m(lambda name: _test_moves_m(test, task, name))
 
     def in_scene(self, task: Task) -> Self:
         """Return this change with the names that things have in all tasks with the initial scene of ``task``."""
         shifts = {_scene_name(task, name): shift for name, shift in self.shifts.items()}
         return super().in_scene(task).model_copy(update={"moves": _moves(shifts)})
 
-    def apart(self, others: Sequence[ScenePerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[ScenePerturbation]) -> Floats:
         """Return the distances (N,) to N perturbations, over all things that both move."""
         shifts_of_others = [perturbation.shifts_in_all for perturbation in others]
-        return self._apart_m(lambda name: [shifts.get(name, NOWHERE) for shifts in shifts_of_others])
+        return self._distances_m(lambda name: [shifts.get(name, NOWHERE) for shifts in shifts_of_others])
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Measure the displacements of the objects that the task moves."""
@@ -273,7 +273,7 @@ class ScenePerturbation(_PosePerturbation):
         """Displacement of each thing from its place in the demonstration."""
         return _shifts(self.moves)
 
-    def _apart_m(self, moves_m: Callable[[str], ArrayLike]) -> Floats:
+    def _distances_m(self, moves_m: Callable[[str], ArrayLike]) -> Floats:
         """Return the distances (N,) to scenes, given a function from a thing's name to its moves (N, 2)."""
         shifts = self.shifts_in_all
         offsets_m = [np.subtract(moves_m(move.name), shifts[move.name]) for move in self.moves]

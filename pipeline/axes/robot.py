@@ -104,11 +104,11 @@ class RobotPerturbation(PhysicsPerturbation):
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the offsets of all robot tasks; all tasks share one arm."""
         rows = [int(tested.parameters["id"]) - 1 for tested in test.on_axis("robot")]
-        return self._apart_rad(benchmark_offsets_rad())[rows]
+        return self._distances_rad(benchmark_offsets_rad())[rows]
 
-    def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
+    def distances_to(self, others: Sequence[RobotPerturbation]) -> Floats:
         """Return the distances (N,) to the offsets of N perturbations of any task; all tasks share one arm."""
-        return self._apart_rad([perturbation.joint_offsets_rad for perturbation in others])
+        return self._distances_rad([perturbation.joint_offsets_rad for perturbation in others])
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
         """Return the distance to the nearest of the benchmark's 500 offsets, of which its robot tasks use 450.
@@ -118,7 +118,7 @@ class RobotPerturbation(PhysicsPerturbation):
         compared = len(test.on_axis("robot"))
         if not compared:
             return Nearest(np.inf, compared)
-        return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()), compared)
+        return Nearest(float(self._distances_rad(benchmark_offsets_rad()).min()), compared)
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Measure the displacement and the rotation of the hand at the start from the clean twin's start."""
@@ -126,7 +126,7 @@ class RobotPerturbation(PhysicsPerturbation):
         if twin is not None:
             yield from measure_start(episode.look(), twin, self.component, self.level)
 
-    def _apart_rad(self, offsets_rad: ArrayLike) -> Floats:
+    def _distances_rad(self, offsets_rad: ArrayLike) -> Floats:
         """Return the distances (N,) to offsets (N, 7)."""
         return np.asarray(np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1))
 

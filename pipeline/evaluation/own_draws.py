@@ -187,7 +187,7 @@ class PlannedDraws:
         comparable = self._draws.get(_comparable(drawn, task), [])
         if not comparable:
             return math.inf, ""
-        distances = drawn.in_scene(task).apart([perturbation for perturbation, _ in comparable])
+        distances = drawn.in_scene(task).distances_to([perturbation for perturbation, _ in comparable])
         if not np.isfinite(distances).any():
             return math.inf, ""
         closest = int(np.nanargmin(distances))

@@ -120,7 +120,7 @@ def _execute(
             succeeded.append(environment.succeeded())
     except RejectedError as error:
         rejected = Verdict(False, error.reason)
-    judged = rejected or verdict(np.stack(states), np.array(succeeded, bool))
+    judged = rejected or judge(np.stack(states), np.array(succeeded, bool))
     return _Executed(np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged)
 
 
@@ -159,7 +159,7 @@ def _apply_perturbations(
     return scene, None
 
 
-def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
+def judge(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
     """Judge a replay: the task's goal must hold after the last executed action.
 
     Args:

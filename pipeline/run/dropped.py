@@ -15,7 +15,7 @@ from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
 from pipeline.planning.streams import streams_of
 from pipeline.run import machine
-from pipeline.run.outcome import FAILURE_REASONS, rejections, rendered
+from pipeline.run.outcome import FAILURE_REASONS, has_frames, rejections
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
@@ -132,7 +132,7 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
     undecided = Verdict(False, NOT_REPLAYED)
     # A reserve is needed unless the candidates before it are replayed, rendered and kept.
     verdict_of = {row.trajectory_id: verdicts.get(row.trajectory_id, undecided) for row in rows}
-    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not rendered(row, frames, views)}
+    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not has_frames(row, frames, views)}
     judged = select(rows, verdict_of, not_rendered | rejected)
     trajectories: set[str] = set()
     streams: set[tuple[str, str]] = set()

@@ -21,7 +21,7 @@ from pipeline.identity import DISTRIBUTION, VERSIONS, versions
 from pipeline.libero.tasks import exceeds_step_limit
 from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED
-from pipeline.run.outcome import Outcome, rendered
+from pipeline.run.outcome import Outcome, has_frames
 from pipeline.tables import column, columns_of, read_table, write_table
 from pipeline.types import Quality
 
@@ -125,7 +125,7 @@ def build(
         verdict = run.verdicts[row.episode_id]
         # The trajectory of a reserve that was not needed may be stored for another episode.
         replayed = run.trajectories.get(row.trajectory_id, {}) if verdict.reason != NOT_NEEDED else {}
-        frames = run.frames[row.trajectory_id] if replayed and rendered(row, run.frames) else None
+        frames = run.frames[row.trajectory_id] if replayed and has_frames(row, run.frames) else None
         result = Result(
             kept=verdict.kept,
             reason=verdict.reason,

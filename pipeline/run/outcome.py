@@ -73,7 +73,7 @@ def shuffled(episode_ids: Iterable[str]) -> list[str]:
     return sorted(episode_ids, key=lambda episode_id: digest("order", episode_id))
 
 
-def replayed(
+def read_replays(
     rows: Sequence[plan.Row],
     store: TrajectoryStore,
     rejected: Mapping[str, str] | None = None,
@@ -123,7 +123,7 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
     stored_frames = frames_by_trajectory(frames.rows())
     views = config.render.content.views
     rejected = rejections(rows, stored_frames, views)
-    replays = replayed(rows, trajectories, rejected, config.filter)
+    replays = read_replays(rows, trajectories, rejected, config.filter)
     judged = selection.select(rows, verdicts_of(replays, rows, config.filter), rejected)
     where = config.export.where
     if where:
@@ -132,7 +132,7 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
                 judged[row.episode_id] = Verdict(False, LEFT_OUT)
     failures = [row for row in list_failures(rows, judged, config.export) if row.episode_id not in rejected]
     kept = [row for row in rows if judged[row.episode_id].kept]
-    not_rendered = [row for row in (*kept, *failures) if not rendered(row, stored_frames, views)]
+    not_rendered = [row for row in (*kept, *failures) if not has_frames(row, stored_frames, views)]
     folders = dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)
     _reject_missing(list(folders), "render")
     return Outcome(rows, replays, stored_frames, judged, [row.episode_id for row in failures])
@@ -149,7 +149,7 @@ def list_failures(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], expor
     return [row for row in failures if where.takes(row.axis, row.component, row.level, row.suite)]
 
 
-def rendered(row: plan.Row, frames: Mapping[str, StoredFrames], views: tuple[str, ...] = STANDARD.views) -> bool:
+def has_frames(row: plan.Row, frames: Mapping[str, StoredFrames], views: tuple[str, ...] = STANDARD.views) -> bool:
     """Return whether the frames of an episode's views are stored."""
     needed = {stream.stream_id for stream in streams_of(row.perturbations, views).values()}
     return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams

@@ -142,12 +142,12 @@ class Store(ABC):
 
     def _rows(self) -> tuple[dict[str, dict[str, Any]], bool]:
         """Return the rows, and True if the table on disk has exactly these rows and all of them are valid."""
-        valid, invalid_names = self._believed()
+        valid, invalid_names = self._compare_table_with_files()
         candidates = valid | {name: self.row(name) for name in invalid_names}
         rows = {name: row for name, row in candidates.items() if row and row["made_by"] == self.made_by}
         return dict(sorted(rows.items())), not invalid_names and len(rows) == len(valid)
 
-    def _believed(self) -> tuple[dict[str, dict[str, Any]], set[str]]:
+    def _compare_table_with_files(self) -> tuple[dict[str, dict[str, Any]], set[str]]:
         """Return the table's valid rows, of any fingerprint, and the names of all other files, deleted files included.
 
         A row is valid if its file has not changed since the table was written.
@@ -168,7 +168,7 @@ class Store(ABC):
         Raises:
             PipelineError: as ``rows``.
         """
-        valid, invalid_names = self._believed()
+        valid, invalid_names = self._compare_table_with_files()
         rows = dict(valid)
         for name in sorted(invalid_names):
             if self.path(name).exists():
@@ -218,12 +218,12 @@ class Store(ABC):
         """
         if self.untouched():
             return None
-        _, invalid_names = self._believed()
+        _, invalid_names = self._compare_table_with_files()
         return self.path(min(invalid_names)) if invalid_names else self.root / TABLE
 
     def notice_changes(self) -> None:
         """Update the table if files were deleted or changed since it was written."""
-        if (self.root / TABLE).exists() and self._believed()[1]:
+        if (self.root / TABLE).exists() and self._compare_table_with_files()[1]:
             self.refresh()
 
     def refresh(self) -> dict[str, dict[str, Any]]:
@@ -234,7 +234,7 @@ class Store(ABC):
         rows, table_up_to_date = self._rows()
         records = self._records()
         if not table_up_to_date or self.made_by not in records:
-            listed, _ = self._believed()
+            listed, _ = self._compare_table_with_files()
             self._write(listed | rows, records | {self.made_by: Record(self.basis)})
         return rows
 

@@ -83,7 +83,7 @@ def test_a_push_at_a_grasp_or_after_the_end_is_refused() -> None:
 
 def test_draws_are_apart_by_their_impulse_where_they_begin_at_the_same_step() -> None:
     one, stronger, later = pushed_at(8, 20), pushed_at(8, 60), pushed_at(9, 20)
-    apart = one.apart([one, stronger, later])
+    apart = one.distances_to([one, stronger, later])
     assert apart[:2] == pytest.approx([0.0, 8.0])
     assert np.isnan(apart[2])
 

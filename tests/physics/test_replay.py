@@ -23,7 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.starts import NOOP_NORM, kept_actions
 from pipeline.physics.environment import Environment, shared
-from pipeline.physics.replay import replay, verdict
+from pipeline.physics.replay import judge, replay
 from pipeline.planning import plan
 from pipeline.run.replay_job import ReplayJob
 from pipeline.run.replay_stage import Replays
@@ -200,10 +200,10 @@ def test_state_of_another_scene_is_refused(short_demos: Path, whole: dict[Task, 
 )
 def test_verdicts(succeeded: list[bool], reason: str) -> None:
     states = np.zeros((len(succeeded) + 1, 5))
-    assert verdict(states, np.array(succeeded)).reason == reason
+    assert judge(states, np.array(succeeded)).reason == reason
 
 
 def test_diverged_simulation_is_dropped() -> None:
     states = np.zeros((12, 5))
     states[5, 2] = np.nan
-    assert verdict(states, np.ones(11, bool)).reason == "simulation_unstable"
+    assert judge(states, np.ones(11, bool)).reason == "simulation_unstable"
