@@ -14,6 +14,14 @@ def about(axis: Literal["y", "z"], angle_deg: float) -> Floats:
     return np.array([w, 0.0, s, 0.0] if axis == "y" else [w, 0.0, 0.0, s])
 
 
+def matrix(axis: Floats, angle_deg: float) -> Floats:
+    """Return the matrix (3, 3) of a right-handed rotation about a unit axis."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.deg2rad(angle_deg)
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+
+
 def product(a: Floats, b: Floats) -> Floats:
     """Return the Hamilton product of two quaternions (w, x, y, z): the rotation ``b`` followed by ``a``."""
     scalar = a[0] * b[0] - a[1:] @ b[1:]

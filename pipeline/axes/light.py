@@ -18,6 +18,7 @@ from pydantic import Field, NonNegativeFloat
 from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, Level, RenderPerturbation, Share, sample_number
 from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Strips
 from pipeline.libero import bddl
+from pipeline.rotations import matrix
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Frame, Task
 
@@ -97,7 +98,7 @@ class LightPerturbation(RenderPerturbation):
             azimuth = np.deg2rad(self.tilt_azimuth_deg)
             # A rotation about this axis turns a direction that points down towards the azimuth.
             across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-            model.light_dir[:] = model.light_dir @ _rotation(across, self.tilt_deg).T
+            model.light_dir[:] = model.light_dir @ matrix(across, self.tilt_deg).T
         if self.shadows:
             model.light_castshadow[:] = True
             _limit(model.light_diffuse, model.light_directional, SHADOWED_DIFFUSE)
@@ -259,11 +260,3 @@ def _limit(colours: NDArray[np.float32], directional: NDArray[np.bool_], most: f
     # A spot light reaches its own part of the room, a directional light the whole room.
     total = strength[everywhere].sum() + strength[~everywhere].max(initial=0.0)
     colours *= most / max(total, most)
-
-
-def _rotation(axis: NDArray[np.float64], angle_deg: float) -> NDArray[np.float64]:
-    """Return the matrix (3, 3) of a right-handed rotation about a unit axis."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.deg2rad(angle_deg)
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)

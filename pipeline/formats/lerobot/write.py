@@ -248,7 +248,7 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, conven
     }
 
 
-def _step_columns(episode: Episode, found: Numbers, convention: Convention, content: Content) -> dict[str, pa.Array]:
+def _step_columns(episode: Episode, numbers: Numbers, convention: Convention, content: Content) -> dict[str, pa.Array]:
     """Return the columns of an episode's steps, with its images if they are stored as such."""
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, geometry in episode.geometry.items():
@@ -261,7 +261,7 @@ def _step_columns(episode: Episode, found: Numbers, convention: Convention, cont
             cells = [{"bytes": packed, "path": None} for packed in files]
             images[ALL_VIEWS[view].lerobot_key] = pa.array(cells, image_type)
     stored = {}
-    for name, values in found.items():
+    for name, values in numbers.items():
         if values.ndim == 1:
             stored[name] = pa.array(values)
         else:
@@ -275,21 +275,21 @@ def _picture_statistics(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
 
 
 def _episode_statistics(
-    found: Numbers, shown: Mapping[str, Counts], columns: Mapping[str, str]
+    numbers: Numbers, levels: Mapping[str, Counts], columns: Mapping[str, str]
 ) -> dict[str, dict[str, NDArray[Any]]]:
     """Compute lerobot's statistics of an episode by column: (D,) of numbers, (3, 1, 1) of frames; ``count`` is (1,).
 
     Args:
-        found: the columns of numbers.
-        shown: counts of levels by the names of ``columns``.
+        numbers: the columns of numbers.
+        levels: counts of levels by the names of ``columns``.
         columns: ``Convention.pictures``.
     """
     of_numbers = {}
-    for name, values in found.items():
+    for name, values in numbers.items():
         rows = values.reshape(len(values), -1)
         of_numbers[name] = describe(rows, QUANTILES) | {"count": np.array([len(values)])}
-    steps = len(found["timestamp"])
-    return of_numbers | {columns[name]: _picture_statistics(counts, steps) for name, counts in shown.items()}
+    steps = len(numbers["timestamp"])
+    return of_numbers | {columns[name]: _picture_statistics(counts, steps) for name, counts in levels.items()}
 
 
 def _provenance_schema(content: Content) -> pa.Schema:
@@ -317,9 +317,11 @@ def _provenance_row(episode: Episode, index: int) -> dict[str, Any]:
 # Files of both versions.
 
 
-def _write_summary(path: Path, made: Sequence[tuple[dict[str, Any], Mapping[str, Counts]]], content: Content) -> None:
+def _write_summary(
+    path: Path, summaries: Sequence[tuple[dict[str, Any], Mapping[str, Counts]]], content: Content
+) -> None:
     """Write ``PROVENANCE`` and ``LEVELS`` of a piece, from the provenance and the levels of each episode."""
-    rows, counts_of_episodes = zip(*made, strict=True)
+    rows, counts_of_episodes = zip(*summaries, strict=True)
     pq.write_table(pa.Table.from_pylist(list(rows), schema=_provenance_schema(content)), path / PROVENANCE)
     levels = {}
     for name in counts_of_episodes[0]:
@@ -431,7 +433,7 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, co
         PipelineError: when an episode breaks the schema.
     """
     path.mkdir()
-    rows, made = [], []
+    rows, summaries = [], []
     with ExitStack() as opened:
         data = opened.enter_context(pq.ParquetWriter(path / DATA, _data_schema(convention.columns(content))))
         videos, depth_videos = {}, {}
@@ -455,15 +457,22 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, co
             for name, figures in _episode_statistics(numbers, levels, convention.pictures(content)).items():
                 row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
             rows.append(row)
-            made.append((_provenance_row(episode, index), levels))
-    table = pa.Table.from_pylist(rows)
-    # An empty list has no type of its own, and lerobot reads all files as one table.
+            summaries.append((_provenance_row(episode, index), levels))
+    pq.write_table(_episodes_table(rows), path / EPISODES)
+    _write_summary(path, summaries, content)
+
+
+def _episodes_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
+    """Return the rows of ``meta/episodes`` as a table, with the types of all lists of labels.
+
+    An empty list has no type of its own, and lerobot reads all files as one table.
+    """
+    table = pa.Table.from_pylist(list(rows))
     for name, dtype in SCHEMA.labels.items():
         place = table.schema.get_field_index(name)
         values = pa.array(table[name].to_pylist(), pa.list_(pa.type_for_alias(dtype)))
         table = table.set_column(place, name, values)
-    pq.write_table(table, path / EPISODES)
-    _write_summary(path, made, content)
+    return table
 
 
 def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, content: Content) -> None:
@@ -539,7 +548,7 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
         PipelineError: when an episode breaks the schema.
     """
     path.mkdir()
-    made = []
+    summaries = []
     with ExitStack() as opened:
         episodes, stats = (opened.enter_context((path / name).open("w")) for name in LINES_V21)
         for index, _, episode, numbers in _load_each(piece, load, convention, content):
@@ -551,8 +560,8 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
             row |= {"episode_id": episode.episode_id, **labels_of(episode)}
             episodes.write(json.dumps(row) + "\n")
             stats.write(json.dumps({"episode_index": index, "stats": figures}) + "\n")
-            made.append((_provenance_row(episode, index), levels))
-    _write_summary(path, made, content)
+            summaries.append((_provenance_row(episode, index), levels))
+    _write_summary(path, summaries, content)
 
 
 def _write_episode_v21(
