@@ -54,16 +54,7 @@ def replay(
         scene, rejected = _apply_perturbations(environment, demo, replay_config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
-        return Trajectory(
-            trajectory_id,
-            mode="open_loop",
-            scene=Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)}),
-            states=demo.init_state[None],
-            actions=np.empty((0, 7)),
-            site_alpha=np.empty((1, 0), np.float32),
-            verdict=Verdict(False, error.reason),
-        )
-
+        return _without_simulation(demo, trajectory_id, error)
     if rejected:
         mode = "tracked" if replay_config.mode == "tracked" and reference() is not None else "open_loop"
         # The first state alone is stored.
@@ -89,6 +80,19 @@ def replay(
         if followed is None:
             return open_loop
     return replay_by("tracked", lambda: _tracking(environment, followed))
+
+
+def _without_simulation(demo: Demo, trajectory_id: str, error: UnusableSceneError) -> Trajectory:
+    """Return the dropped trajectory of a demonstration whose scene or state cannot be simulated."""
+    return Trajectory(
+        trajectory_id,
+        mode="open_loop",
+        scene=Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)}),
+        states=demo.init_state[None],
+        actions=np.empty((0, 7)),
+        site_alpha=np.empty((1, 0), np.float32),
+        verdict=Verdict(False, error.reason),
+    )
 
 
 class _Executed(NamedTuple):
