@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,12 +49,13 @@ class Where(Frozen):
 
     def takes(self, axis: str, component: str, level: str, suite: str) -> bool:
         """Return whether an episode is written, by its columns of the plan."""
-        return (
-            (self.axis is None or axis in self.axis)
-            and (self.component is None or set(component.split("+")) <= set(self.component))
-            and (self.level is None or set(map(int, level.split("+"))) <= set(self.level))
-            and (self.suite is None or suite in self.suite)
+        filters: tuple[tuple[Collection[object] | None, set[object]], ...] = (
+            (self.axis, {axis}),
+            (self.component, {*component.split("+")}),
+            (self.level, {*map(int, level.split("+"))}),
+            (self.suite, {suite}),
         )
+        return all(listed is None or values.issubset(listed) for listed, values in filters)
 
 
 def _field(kind: type[Format[Any]]) -> tuple[Any, Any]:

@@ -66,7 +66,9 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     stored = None if dataset is None else _record(dataset, row["rlds_index"])
     differs = _differences(stored[1], rebuilt[1]) if stored and rebuilt else {}
     other_version = differs.pop(METADATA + manifest.OWN_VERSION, None) is not None
-    same = stored and rebuilt and (rebuilt[0] == stored[0] or (other_version and not differs))
+    identical: bool | None = None
+    if stored:
+        identical = rebuilt is not None and (rebuilt[0] == stored[0] or (other_version and not differs))
     other_versions = {}
     for name, here in versions().items():
         recorded = row[manifest.version_column(name)]
@@ -74,7 +76,7 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
             other_versions[name] = {"manifest": recorded, "here": here}
     return {
         "episode_id": episode_id,
-        "identical": bool(same) if stored else None,
+        "identical": identical,
         "reason": reason,
         "versions": other_versions,
         "gl_device": {} if row["gl_device"] == device else {"manifest": row["gl_device"], "here": device},
