@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from pipeline.axes.base import Frozen
-from pipeline.types import Count
+from pipeline.types import Count, Frozen
 
 LARGEST_GB = 4.6
 """Largest measured memory of a worker process, in ``validate`` of 1,004 episodes of all 40 tasks (docs/cost.md)."""

@@ -12,7 +12,6 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, fie
 
 from pipeline import origins
 from pipeline.axes import AXES, Axes, Axis, axes_of, components_of
-from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank, load_further_bank
 from pipeline.catalogue import object_sources, texture_sources
 from pipeline.compute_config import ComputeConfig
@@ -25,7 +24,7 @@ from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish_config import PublishConfig
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
-from pipeline.types import LONGEST_NAME, Count, Place, RenderedExtra
+from pipeline.types import LONGEST_NAME, Count, Frozen, Place, RenderedExtra
 
 CHECKOUT = (
     *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),

@@ -13,10 +13,10 @@ from instructions import every_instruction, find_tasks
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from pipeline.axes import axes_of
-from pipeline.axes.base import Frozen
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.seeding import digest
+from pipeline.types import Frozen
 
 PlusAxis = Literal["robot", "language", "pose", "camera", "noise"]
 """Axes whose test tasks need no asset archive."""

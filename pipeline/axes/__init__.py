@@ -10,7 +10,6 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.base import Axis as Axis
-from pipeline.axes.base import Frozen
 from pipeline.axes.base import Perturbation as Perturbation
 from pipeline.axes.base import PhysicsPerturbation as PhysicsPerturbation
 from pipeline.axes.base import PixelPerturbation as PixelPerturbation
@@ -28,7 +27,7 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
 from pipeline.testset.benchmark import TestTask
-from pipeline.types import Task
+from pipeline.types import Frozen, Task
 
 
 class Axes(Frozen):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.axes.base import Axis, ByLevel, Credit, Frozen, RenderPerturbation, Share, pick
+from pipeline.axes.base import Axis, ByLevel, Credit, RenderPerturbation, Share, pick
 from pipeline.axes.report_data import Bars, CoveragePlots, KeptPerturbation, ObservedEpisode
 from pipeline.catalogue import textures
 from pipeline.catalogue.data_maps import DATA_MAPS
@@ -29,7 +29,7 @@ from pipeline.libero import bddl
 from pipeline.libero.arenas import Arena
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Floats, Frame, Task
+from pipeline.types import Floats, Frame, Frozen, Task
 
 if TYPE_CHECKING:
     import mujoco

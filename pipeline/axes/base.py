@@ -23,8 +23,7 @@ from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Measures,
 from pipeline.episode_schema import ALL_VIEWS
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
-from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
-from pipeline.types import Frozen as Frozen
+from pipeline.types import Demo, Floats, Frame, Frozen, RollOut, Scene, Task
 
 if TYPE_CHECKING:
     import mujoco

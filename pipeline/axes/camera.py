@@ -17,7 +17,6 @@ from pipeline.axes.base import (
     Axis,
     ByLevel,
     Degrees,
-    Frozen,
     Intervals,
     Level,
     RenderPerturbation,
@@ -30,7 +29,7 @@ from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation
 from pipeline.errors import PipelineError
 from pipeline.rotations import about, product, rotate
 from pipeline.testset.benchmark import TestSet, TestTask, is_in_tested_scene
-from pipeline.types import Floats, Task
+from pipeline.types import Floats, Frozen, Task
 
 if TYPE_CHECKING:
     import mujoco

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.axes.base import Frozen
 from pipeline.jit import compiled
-from pipeline.types import Floats, Frame
+from pipeline.types import Floats, Frame, Frozen
 
 Component = Literal["motion", "gaussian_blur", "zoom", "fog", "glass"]
 SigmaPx = Annotated[float, Field(ge=0.1, le=100.0)]

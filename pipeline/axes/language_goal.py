@@ -20,9 +20,8 @@ from typing import Annotated, NamedTuple
 import yaml
 from pydantic import BeforeValidator
 
-from pipeline.axes.base import Frozen
 from pipeline.libero.task_goal import Aim, TaskGoal, read_goal
-from pipeline.types import Task
+from pipeline.types import Frozen, Task
 
 SIDES = ("front", "left", "right")
 """Relations that may be given without a word for the place, as in ``to its right``."""

@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal, cast
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Credit, Frozen, PhysicsPerturbation
+from pipeline.axes.base import Axis, Credit, PhysicsPerturbation
 from pipeline.axes.report_data import BENCHMARK, CoveragePlots, Histogram, KeptPerturbation, ObservedEpisode, Scatter
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
@@ -20,7 +20,7 @@ from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS, SURFACES, Arena
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
-from pipeline.types import Demo, Floats, RollOut, Scene, Task
+from pipeline.types import Demo, Floats, Frozen, RollOut, Scene, Task
 
 SHELF = 13
 """Number of models that the objects of one scene are sampled from, as in LIBERO-Plus."""

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
-from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, Level, RenderPerturbation, Share, sample_number
+from pipeline.axes.base import Axis, Degrees, Intervals, Level, RenderPerturbation, Share, sample_number
 from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Strips
 from pipeline.libero import bddl
 from pipeline.rotations import matrix
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Frame, Task
+from pipeline.types import Frame, Frozen, Task
 
 if TYPE_CHECKING:
     import mujoco

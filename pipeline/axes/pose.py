@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from pipeline.axes.base import LEVELS, Axis, Frozen, Level, Perturbation, PhysicsPerturbation, Share, pick, sample_point
+from pipeline.axes.base import LEVELS, Axis, Level, Perturbation, PhysicsPerturbation, Share, pick, sample_point
 from pipeline.axes.report_data import (
     BENCHMARK,
     CoveragePlots,
@@ -33,7 +33,7 @@ from pipeline.libero.carried import definition_of
 from pipeline.libero.task_goal import relation_holds
 from pipeline.libero.tasks import Same, find_task
 from pipeline.testset.benchmark import TestSet, TestTask
-from pipeline.types import Demo, Floats, RollOut, Scene, Task
+from pipeline.types import Demo, Floats, Frozen, RollOut, Scene, Task
 
 Component = Literal["target", "receptacle", "scene"]
 """Moved part of the scene: the object that the goal places, the movable object that it is put on or in, or all things.

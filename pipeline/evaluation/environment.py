@@ -12,7 +12,6 @@ from pydantic import Field, field_serializer
 from scipy.spatial.transform import Rotation
 
 from pipeline.axes import AXES, Perturbation
-from pipeline.axes.base import Frozen
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RejectedError
 from pipeline.evaluation import libero_plus, own_draws
@@ -27,7 +26,7 @@ from pipeline.libero.tasks import STEP_LIMITS, SUITES, find_task
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import SceneFiles
-from pipeline.types import Floats, Frame, Scene, Task
+from pipeline.types import Floats, Frame, Frozen, Scene, Task
 
 LEROBOT_SPATIAL = 280
 """lerobot's step limit of ``libero_spatial``; its other limits equal OpenVLA's (``lerobot/envs/libero.py``, 0.6.1)."""

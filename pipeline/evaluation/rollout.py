@@ -14,7 +14,6 @@ from pydantic import Field
 
 from pipeline import gl, identity
 from pipeline.axes import to_json
-from pipeline.axes.base import Frozen
 from pipeline.axes.component_names import stored_names
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, own_draws, recordings
@@ -36,7 +35,7 @@ from pipeline.libero.tasks import SUITES, find_task
 from pipeline.record import Basis, Record
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
-from pipeline.types import Frame
+from pipeline.types import Frame, Frozen
 
 FILM_STEPS = 8
 """Largest number of steps between two frames of a video, even if the policy observes less often or not at all."""

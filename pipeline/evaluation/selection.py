@@ -17,7 +17,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from pipeline.axes import AXES, axes_of, level_of_test
-from pipeline.axes.base import LEVELS, Frozen
+from pipeline.axes.base import LEVELS
 from pipeline.axes.component_names import ComponentName
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
@@ -27,7 +27,7 @@ from pipeline.evaluation.task_list import read_tasks
 from pipeline.evaluation.tasks import EvaluationTask, balanced, carried_tasks, libero_task, replacements
 from pipeline.libero.tasks import SUITES, find_task, suites, tasks
 from pipeline.testset.benchmark import TESTED_SUITES, load
-from pipeline.types import Task
+from pipeline.types import Frozen, Task
 
 INITIAL_STATES = 50
 """Number of LIBERO's initial states per task."""

@@ -12,7 +12,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field, ValidationError
 
-from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import MAKE_AGAIN, PipelineError
@@ -23,7 +22,7 @@ from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED
 from pipeline.run.outcome import Outcome, has_frames
 from pipeline.tables import column, columns_of, read_table, write_table
-from pipeline.types import Quality
+from pipeline.types import Frozen, Quality
 
 OWN_VERSION = "pipeline_version"
 """Column for the version of this project, for information only: recipe numbers decide which files are up to date."""
