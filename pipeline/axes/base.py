@@ -254,7 +254,7 @@ class Axis(Frozen):
     @classmethod
     def changes_objects(cls) -> bool:
         """Return whether an episode of the axis can show other objects than the scene of its task."""
-        return any(kind.changes_objects for kind in cls.draws)
+        return any(kind.changes_objects for kind in cls.kinds)
 
     def restrict_for(self, axes: Collection[Axis]) -> Axis:
         """Return the axis restricted for episodes that are perturbed on all of ``axes`` together.

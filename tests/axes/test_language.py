@@ -289,7 +289,9 @@ def test_wordings_are_a_tasks_own_without_the_benchmarks(tmp_path: Path, test: T
     tested = next(text for text in texts if lint(text, known, "distraction") is None)
     bank.write_text(yaml.safe_dump({known.suite: {known.name: {"distraction": [tested]}}}))
     assert tested in {card.text for card in list_rewrites(known, bank=bank)}
-    assert {*LanguageAxis(bank=bank).list_clear_rewrites(known, test)} == {*LanguageAxis().list_clear_rewrites(known, test)}
+    assert {*LanguageAxis(bank=bank).list_clear_rewrites(known, test)} == {
+        *LanguageAxis().list_clear_rewrites(known, test)
+    }
 
 
 def test_a_task_without_rewrites_has_no_wordings(test: TestSet) -> None:
