@@ -4,6 +4,7 @@ It cannot be installed here. The stand-in has the names that the script touches,
 what it was given.
 """
 
+import argparse
 import hashlib
 import json
 import os
@@ -20,6 +21,7 @@ from conftest import datasets_in
 from tiny_recipe import NAME, SUITES, export_config, tiny_recipe
 
 from pipeline.clients.recipe import write
+from pipeline.clients.templates.run_openvla_oft import condition
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +208,14 @@ def test_openvla_oft_continues_under_the_statistics_of_a_checkpoint(trained: Pat
     assert done.returncode == 1
     assert "has no statistics for libero_" in done.stderr
     assert "it has: bridge" in done.stderr
+
+
+def test_a_condition_is_a_label_and_its_values() -> None:
+    assert condition("axis=clean,camera+noise") == ("axis", ("clean", "camera+noise"))
+    assert condition("level=0") == ("level", ("0",))
+    for text in ("axis", "axis=", "=camera", "axis=clean,", ""):
+        with pytest.raises(argparse.ArgumentTypeError, match="expected a label and its values: axis=clean,camera"):
+            condition(text)
 
 
 @pytest.mark.parametrize("isolated", [False, True], ids=["other environment", "no packages at all"])

@@ -28,6 +28,13 @@ Each training sample gets one of its episode's rewrites in place of the instruct
 ``rewrite_probability`` of the settings. It is 0 if the run's configuration does not set it; ``--rewrite_probability P``
 overrides it. Validation and LIBERO's own datasets keep their instructions.
 
+To train on a part of the episodes, choose them by labels, the fields of ``episode_metadata`` in the RLDS files. An
+episode has to have one of the listed values of each named label. Clean episodes have the axis ``clean`` and level 0:
+
+    --where axis=clean,camera,camera+noise --where level=0,1,2
+
+Statistics are of the chosen episodes. LIBERO's own datasets are read completely.
+
 OFT's evaluation reads one entry of statistics per suite, ``libero_goal``. It reads ``libero_goal_no_noops`` only if
 ``libero_goal`` is missing. Therefore all datasets of a suite get equal statistics: the statistics of ``--statistics``,
 else those of the suite's first dataset. The first is a dataset of this run if the run has the suite. LIBERO's datasets
@@ -36,6 +43,7 @@ have no split ``val``: leave out ``--use_val_set True``.
 OFT has no flags for the following settings, so this script applies them:
 
 * The datasets and their mixture are registered.
+* The reader leaves out the episodes that ``--where`` does not choose.
 * The rewrites of an episode pass through OFT's loader together with the instruction, and one is sampled per sample.
 * AdamW gets the settings' weight decay (OFT leaves PyTorch's 0.01).
 * A cosine with warm-up replaces OFT's step, because OFT's own warm-up would undo any later decay.
@@ -70,6 +78,15 @@ def mixed(text: str) -> tuple[str, float]:
     return match[1], float(match[2])
 
 
+def condition(text: str) -> tuple[str, tuple[str, ...]]:
+    """Parse a label and its values from a text such as ``axis=clean,camera``."""
+    label, _, values = text.partition("=")
+    listed = tuple(values.split(","))
+    if not label or not all(listed):
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a label and its values: axis=clean,camera")
+    return label, listed
+
+
 def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, float]) -> None:
     """Register every dataset and every mixture in the tables from which OFT reads datasets by name.
 
@@ -95,6 +112,49 @@ def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, fl
                 "state_encoding": configs.StateEncoding.POS_EULER,
                 "action_encoding": configs.ActionEncoding.EEF_POS,
             }
+
+
+def choose_episodes(datasets: Collection[str], conditions: Mapping[str, Collection[str]]) -> None:
+    """Make OFT's loader read only the episodes of these datasets whose labels meet all conditions.
+
+    Args:
+        datasets: datasets of this run; others are read completely.
+        conditions: name of a label to its accepted values.
+    """
+    tf: Any = importlib.import_module("tensorflow")
+    # OFT reads every split through this class.
+    reader: Any = importlib.import_module("dlimp").DLataset
+    read = reader.from_rlds
+
+    def is_chosen(trajectory: dict[str, Any]) -> Any:
+        labels = trajectory["traj_metadata"]["episode_metadata"]
+        met = []
+        for label, values in conditions.items():
+            # OFT's reader repeats each label for every step.
+            value = labels[label][0]
+            text = value if value.dtype == tf.string else tf.strings.as_string(value)
+            met.append(tf.reduce_any(text == tf.constant(list(values))))
+        return tf.reduce_all(met)
+
+    def read_chosen(builder: Any, split: str, **options: Any) -> Any:
+        episodes = read(builder, split=split, **options)
+        if builder.name not in datasets:
+            return episodes
+        labels = episodes.element_spec["traj_metadata"]["episode_metadata"]
+        unknown = conditions.keys() - labels.keys()
+        if unknown:
+            sys.exit(f"error: episodes have no label {' or '.join(sorted(unknown))}\n  they have: {', '.join(labels)}")
+        chosen = episodes.filter(is_chosen)
+        # From no episodes, OFT would wait for its first sample without end.
+        if next(iter(chosen.take(1)), None) is None:
+            wanted = " and ".join(f"{label}={','.join(values)}" for label, values in conditions.items())
+            sys.exit(
+                f"error: no episode of {builder.name}, split {split}, has {wanted}\n"
+                "  try: other values of --where, or --dataset_name for the dataset of one suite"
+            )
+        return chosen
+
+    reader.from_rlds = staticmethod(read_chosen)
 
 
 class SampledRewrites:
@@ -201,13 +261,15 @@ def statistics_of(file: Path, suites: Collection[str]) -> dict[str, dict[str, An
     return former
 
 
-def set_statistics(dataset_sha256: str, suite_of: Mapping[str, str], former: Mapping[str, Mapping[str, Any]]) -> None:
+def set_statistics(content: str, suite_of: Mapping[str, str], former: Mapping[str, Mapping[str, Any]]) -> None:
     """Make OFT normalise all datasets of a suite alike and write the statistics it computes to its cache folder.
 
     In the dataset's folder, ``dataset_statistics_<hash>.json`` would change the dataset's files. OFT confuses the
-    files of two runs with equal sizes and counts, so the manifest's hash becomes part of the file's name.
+    files of two runs with equal sizes and counts, and of two choices of episodes. Therefore ``content`` becomes part of
+    the file's name.
 
     Args:
+        content: text that identifies the episodes: the manifest's hash, and the conditions of ``choose_episodes``.
         suite_of: dataset to suite.
         former: suite to the statistics that replace a dataset's own. The dataset keeps its own counts, which OFT uses
             as weights. If empty, the statistics of a suite's first dataset replace those of the suite's other datasets.
@@ -220,7 +282,7 @@ def set_statistics(dataset_sha256: str, suite_of: Mapping[str, str], former: Map
     shared = dict(former)
 
     def get_dataset_statistics(dataset: Any, hash_dependencies: tuple[str, ...], save_dir: object = None) -> Any:
-        computed = compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
+        computed = compute(dataset, (*hash_dependencies, content), save_dir=str(folder))
         # OFT passes the folder of the dataset's version.
         name = Path(str(save_dir)).parent.name
         suite = suite_of.get(name, name)
@@ -341,6 +403,7 @@ def prepare() -> None:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--statistics", type=Path)
     parser.add_argument("--mix", type=mixed, action="append", default=[])
+    parser.add_argument("--where", type=condition, action="append", default=[])
     rewrite_probability = training.get("rewrite_probability", {"value": 0.0})["value"]
     parser.add_argument("--rewrite_probability", type=probability_of, default=rewrite_probability)
     options, given = parser.parse_known_args()
@@ -359,7 +422,14 @@ def prepare() -> None:
         sample_rewrites({*suites.values()}, options.rewrite_probability, key)
     name_statistics_by_suite(suites)
     former = statistics_of(options.statistics, dict.fromkeys(suite_of.values())) if options.statistics else {}
-    set_statistics(dataset["sha256"]["value"], suite_of, former)
+    content = dataset["sha256"]["value"]
+    if options.where:
+        conditions: dict[str, tuple[str, ...]] = {}
+        for label, values in options.where:
+            conditions[label] = (*conditions.get(label, ()), *values)
+        choose_episodes({*suites.values()}, conditions)
+        content += json.dumps(conditions)
+    set_statistics(content, suite_of, former)
     set_optimiser(training["weight_decay"]["value"], schedule)
 
 
