@@ -5,6 +5,7 @@ import json
 import re
 import runpy
 import shlex
+import subprocess
 from importlib import import_module
 from importlib.metadata import metadata
 from pathlib import Path
@@ -85,7 +86,7 @@ def test_a_run_of_both_conventions_has_all_clients(tmp_path: Path) -> None:
     assert recipe["clients_of_other_formats"].keys() == {"robomimic"}
     assert "$DATA/lerobot_openpi " in recipe["clients"]["openpi"]["command"]
     assert "--datasets.vla_data.data_root_dir lerobot_v21 " in recipe["clients"]["starvla"]["command"]
-    assert "cp -r $DATA/lerobot_v21 lerobot_v21`" in recipe["clients"]["starvla"]["where"]
+    assert "cp -rs $DATA/lerobot_v21 lerobot_v21`" in recipe["clients"]["starvla"]["where"]
     named = [client for dataset in export.datasets(tmp_path) for client in dataset.clients]
     assert sorted(named) == sorted(recipe["clients"])
 
@@ -260,3 +261,24 @@ def test_gr00t_leaves_the_statistics_of_a_set_as_they_are(tmp_path: Path) -> Non
     assert {"observation.state", "action"} < {*numbers}
     for name in numbers:
         assert {"mean", "std", "min", "max", "q01", "q99"} <= stats[name].keys()
+
+
+@pytest.mark.parametrize("client", ["starvla", "gr00t"])
+def test_files_that_a_client_adds_or_replaces_do_not_reach_the_dataset(client: str, tmp_path: Path) -> None:
+    data, checkout = tmp_path / "data", tmp_path / "checkout"
+    target = write_lerobot_v21(data, "ipec")
+    options = export_config(lerobot_v21=target.options)
+    recipe = tiny_recipe(tmp_path, options)
+    write(recipe, data / "finetune", options, datasets_in(data))
+    before = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
+    modality = checkout / "examples" / "LIBERO" / "modality.json"
+    modality.parent.mkdir(parents=True)
+    modality.write_text("of GR00T")
+    for line in re.findall(r"`([^`]*cp [^`]*)`", recipe["clients"][client]["where"]):
+        command = re.sub(r"\bSET\b", SET, line).replace("$DATA", str(data))
+        subprocess.run(["bash", "-ec", command], cwd=checkout, check=True)
+    (folder,) = (path.parent for path in checkout.rglob("meta") if path.parent.name == SET)
+    (folder / "meta" / "added.json").write_text("{}")
+    assert {path: path.read_bytes() for path in data.rglob("*") if path.is_file()} == before
+    assert all(path.is_symlink() for path in (folder / "data").rglob("*.parquet"))
+    assert ((folder / "meta" / "modality.json").read_text() == "of GR00T") == (client == "gr00t")
