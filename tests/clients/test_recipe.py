@@ -282,3 +282,17 @@ def test_files_that_a_client_adds_or_replaces_do_not_reach_the_dataset(client: s
     assert {path: path.read_bytes() for path in data.rglob("*") if path.is_file()} == before
     assert all(path.is_symlink() for path in (folder / "data").rglob("*.parquet"))
     assert ((folder / "meta" / "modality.json").read_text() == "of GR00T") == (client == "gr00t")
+
+
+def test_starvla_serves_and_evaluates_its_last_checkpoint(tmp_path: Path) -> None:
+    export = export_config(lerobot_v21={"name": NAME, "convention": "ipec"})
+    client = tiny_recipe(tmp_path, export)["clients"]["starvla"]
+    words = shlex.split(client["command"])
+    root, run, steps, interval = (
+        words[words.index(option) + 1]
+        for option in ("--run_root_dir", "--run_id", "--trainer.max_train_steps", "--trainer.save_interval")
+    )
+    checkpoint = f"{root}/{run}/checkpoints/steps_{steps}_pytorch_model.pt"
+    assert int(steps) % int(interval) == 0, "starVLA stores the last step only at a multiple"
+    assert f"--ckpt_path {checkpoint} --port 6694 " in client["evaluate"]["server"]
+    assert f" CKPT={checkpoint} PORT=6694 " in client["evaluate"]["command"]
