@@ -296,3 +296,14 @@ def test_starvla_serves_and_evaluates_its_last_checkpoint(tmp_path: Path) -> Non
     assert int(steps) % int(interval) == 0, "starVLA stores the last step only at a multiple"
     assert f"--ckpt_path {checkpoint} --port 6694 " in client["evaluate"]["server"]
     assert f" CKPT={checkpoint} PORT=6694 " in client["evaluate"]["command"]
+
+
+def test_gr00t_serves_its_last_checkpoint(tmp_path: Path) -> None:
+    export = export_config(lerobot_v21={"name": NAME, "convention": "ipec"})
+    client = tiny_recipe(tmp_path, export)["clients"]["gr00t"]
+    words = shlex.split(client["command"])
+    settings = dict(word.split("=") for word in words if "=" in word)
+    folder, tag = (words[words.index(option) + 1] for option in ("--output-dir", "--embodiment-tag"))
+    assert int(settings["MAX_STEPS"]) % int(settings["SAVE_STEPS"]) == 0
+    served = f"--model-path {folder}/checkpoint-{settings['MAX_STEPS']} --embodiment-tag {tag} "
+    assert served in client["evaluate"]["server"]
