@@ -31,6 +31,7 @@ OPENPI = "pi05_libero"
 
 EXPORTS = {
     "openvla_oft": "export: {rlds: {}}",
+    "vla_adapter": "export: {rlds: {}}",
     "lerobot_act": "export: {lerobot: {}}",
     "lerobot_smolvla": "export: {lerobot: {}}",
     "lerobot_pi05": "export: {lerobot: {}}",

@@ -60,7 +60,7 @@ class Rlds(Format[RldsConfig]):
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
         column("rlds_index", pa.int64(), "place in the shard, null when dropped"),
     )
-    clients = ("openvla_oft",)
+    clients = ("openvla_oft", "vla_adapter")
 
     def __init__(self, data: Path, options: RldsConfig, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)

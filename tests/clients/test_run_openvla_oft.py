@@ -8,6 +8,7 @@ import argparse
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -173,6 +174,21 @@ def test_openvla_oft_is_given_datasets_recipe_and_schedule(trained: Path, tmp_pa
     statistics = json.loads((checkout / "dataset_statistics.json").read_text())
     # OFT's evaluation asks for the suite's name.
     assert (statistics["libero_spatial"], statistics["libero_10"]) == (1, 2)
+
+
+@pytest.mark.slow
+def test_vla_adapter_is_given_its_own_weights_and_keeps_its_optimizer(trained: Path, tmp_path: Path) -> None:
+    """Its script has no option for the weights of OpenVLA."""
+    checkout, script = stand_in(tmp_path / "adapter", OFT), trained / "finetune" / "run_openvla_oft.py"
+    _, _, words = tiny_recipe(tmp_path)["clients"]["vla_adapter"]["command"].partition("run_openvla_oft.py ")
+    seen = run(checkout, script, *shlex.split(words), "--lr_warmup_steps", "0", "--max_steps", "5")
+    arguments = seen["arguments"]
+    assert not {"--vla_path", "--client"} & arguments.keys()
+    given = {"--config_file_path": "pretrained_models/configs", "--lora_rank": "64", "--use_proprio": "True"}
+    assert given.items() <= arguments.items()
+    assert seen["weight_decay"] == 0.01, "PyTorch's, as in its own script"
+    assert {*seen["rates"].values()} == {2e-4}
+    assert {*seen["transforms"]} == {*SUITES.values()}
 
 
 @pytest.mark.slow

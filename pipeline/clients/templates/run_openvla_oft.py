@@ -40,6 +40,10 @@ OFT's evaluation reads one entry of statistics per suite, ``libero_goal``. It re
 else those of the suite's first dataset. The first is a dataset of this run if the run has the suite. LIBERO's datasets
 have no split ``val``: leave out ``--use_val_set True``.
 
+VLA-Adapter has OFT's loader, and a ``vla-scripts/finetune.py`` with other options for its weights. In its checkout, add
+``--client vla_adapter`` and the options of ``finetune.yaml``. Its optimizer and schedule stay as they are. With
+``--resume`` it loads only the action head and the projector of a checkpoint, so ``--statistics`` is for OFT.
+
 OFT has no flags for the following settings, so this script applies them:
 
 * The datasets and their mixture are registered.
@@ -66,6 +70,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
+OFT = "openvla_oft"
 SCRIPT = "vla-scripts/finetune.py"
 DATASETS = "prismatic.vla.datasets.rlds"
 
@@ -369,11 +374,11 @@ def set_optimiser(weight_decay: float, schedule: Schedule) -> None:
     optim.AdamW, optim.lr_scheduler.MultiStepLR = AdamW, Cosine
 
 
-def arguments(recipe: Mapping[str, Any]) -> list[str]:
-    """Return the recipe as arguments of OFT's script."""
+def arguments(recipe: Mapping[str, Any], client: str) -> list[str]:
+    """Return the recipe as arguments of the client's script."""
     training = {name: field["value"] for name, field in recipe["training"].items()}
-    flags = {
-        "vla_path": training["base_weights"],
+    flags = {"vla_path": training["base_weights"]} if client == OFT else {}
+    flags |= {
         "data_root_dir": HERE.parent / "rlds",
         "dataset_name": recipe["name"],
         "batch_size": training["batch_size_per_gpu"],
@@ -401,6 +406,7 @@ def prepare() -> None:
     recipe = yaml.safe_load((HERE / "finetune.yaml").read_text())
     dataset, training = recipe["dataset"], recipe["training"]
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--client", choices=[OFT, "vla_adapter"], default=OFT)
     parser.add_argument("--statistics", type=Path)
     parser.add_argument("--mix", type=mixed, action="append", default=[])
     parser.add_argument("--where", type=condition, action="append", default=[])
@@ -414,8 +420,8 @@ def prepare() -> None:
         given, training["steps"]["value"], training["warmup_steps"]["value"], anew=options.statistics is not None
     )
     # OFT derives its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" in the arguments.
-    # If a flag is given twice, its last value counts. OFT's own warm-up would undo the cosine, so it is set to 0.
-    sys.argv = [SCRIPT, *arguments(recipe), *given, "--lr_warmup_steps", "0"]
+    # If a flag is given twice, its last value counts.
+    sys.argv = [SCRIPT, *arguments(recipe, options.client), *given]
     register(dataset["mixtures"]["value"], added)
     if options.rewrite_probability:
         key = f"process {os.environ.get('RANK', '0')}, from step {schedule.first}"
@@ -430,19 +436,22 @@ def prepare() -> None:
         choose_episodes({*suites.values()}, conditions)
         content += json.dumps(conditions)
     set_statistics(content, suite_of, former)
-    set_optimiser(training["weight_decay"]["value"], schedule)
+    if options.client == OFT:
+        # OFT's own warm-up would undo the cosine.
+        sys.argv += ["--lr_warmup_steps", "0"]
+        set_optimiser(training["weight_decay"]["value"], schedule)
 
 
 def main() -> None:
     """Run OFT's script with the recipe, or end with a message if OFT cannot be imported."""
     if not Path(SCRIPT).is_file():
-        sys.exit(f"error: no {SCRIPT} in {Path.cwd()}\n  try: call this in a checkout of OpenVLA-OFT")
+        sys.exit(f"error: no {SCRIPT} in {Path.cwd()}\n  try: call this in a checkout of OpenVLA-OFT or VLA-Adapter")
     try:
         prepare()
     except ModuleNotFoundError as error:
         sys.exit(
             f"error: {sys.executable} has no module {error.name}\n"
-            "  try: activate the environment of OpenVLA-OFT (its SETUP.md), and call torchrun there"
+            "  try: activate the environment of OpenVLA-OFT (its SETUP.md) or VLA-Adapter, and call torchrun there"
         )
     runpy.run_path(SCRIPT, run_name="__main__")
 
