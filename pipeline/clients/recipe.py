@@ -35,6 +35,8 @@ EXPORTS = {
     "lerobot_act": "export: {lerobot: {}}",
     "lerobot_smolvla": "export: {lerobot: {}}",
     "lerobot_pi05": "export: {lerobot: {}}",
+    "lerobot_pi0_fast": "export: {lerobot: {}}",
+    "lerobot_molmoact2": "export: {lerobot: {}}",
     "starvla": "export: {lerobot_v21: {convention: ipec}}",
     "gr00t": "export: {lerobot_v21: {convention: ipec}}",
     "openpi": "export: {lerobot_openpi: {}}",
@@ -112,7 +114,7 @@ def _training_and_clients(
         tested: options of ``evaluate`` with the tasks to test; empty for its default, LIBERO's four suites.
     """
     cameras = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), 1)}
-    values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
+    values = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras), "image_keys": json.dumps([*cameras])}
     values |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
     values |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
     values |= {"rewrite_probability": rewrite_probability, "tested": tested}

@@ -25,6 +25,7 @@ from vla_eval.model_servers.base import ModelServer
 from pipeline.clients.recipe import build, write
 from pipeline.export_config import ExportConfig
 from pipeline.files import schema_file
+from pipeline.formats.lerobot import LeRobot
 
 
 def evaluated_here(recipe: dict[str, Any]) -> dict[str, Any]:
@@ -177,7 +178,7 @@ def test_the_evaluation_of_each_trained_policy_is_understood_by_both_programs(tm
     export = export_config(lerobot_openpi={"name": NAME, "validation": 0.1})
     recipe = tiny_recipe(tmp_path, export)
     evaluated = evaluated_here(recipe)
-    assert evaluated.keys() == {"openvla_oft", "lerobot_act", "lerobot_smolvla", "lerobot_pi05", "openpi"}
+    assert evaluated.keys() == {"openvla_oft", "openpi", *LeRobot.clients}
     for commands in evaluated.values():
         words = shlex.split(commands["command"])
         assert words[:3] == ["python", "-m", "pipeline"]
@@ -213,7 +214,7 @@ def test_policies_of_own_tasks_are_evaluated_on_these(tmp_path: Path) -> None:
     assert "N is the number of control steps" in recipe["evaluation"]["own_tasks"]
 
 
-@pytest.mark.parametrize("client", ["lerobot_act", "lerobot_smolvla", "lerobot_pi05"])
+@pytest.mark.parametrize("client", LeRobot.clients)
 def test_pypi_has_the_extras_that_a_client_needs(client: str, tmp_path: Path) -> None:
     """pip only warns of a missing extra. An extra of lerobot's repository has an address after it."""
     lerobot = metadata("lerobot")

@@ -97,7 +97,7 @@ def test_the_recipes_leave_depth_videos_out_of_the_inputs(tmp_path: Path) -> Non
     export = ExportConfig().model_copy(update={"lerobot": lerobot})
     content = Content(size_px=128, extras=("depth",))
     clients = recipe.build(manifest, [], export, content=content)["clients"]
-    for client in ("lerobot_act", "lerobot_pi05"):
+    for client in ("lerobot_act", "lerobot_pi05", "lerobot_pi0_fast"):
         words = shlex.split(clients[client]["command"])[1:]
         options: Any = draccus.argparsing.parse(TrainPipelineConfig, args=words)
         shapes = {name: tuple(feature.shape) for name, feature in options.policy.input_features.items()}

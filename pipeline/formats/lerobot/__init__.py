@@ -122,7 +122,7 @@ class LeRobot(Format[LeRobotConfig]):
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
-    clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
+    clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05", "lerobot_pi0_fast", "lerobot_molmoact2")
 
     def __init__(self, data: Path, options: LeRobotConfig, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
