@@ -69,6 +69,19 @@ def test_every_client_is_named_by_the_format_that_it_reads(convention: str, tmp_
     assert sorted(named) == sorted(tiny_recipe(tmp_path, export)["clients"])
 
 
+def test_policies_of_lerobot_are_left_out_where_the_gripper_is_not_that_of_their_evaluation(tmp_path: Path) -> None:
+    export = export_config(lerobot={"name": NAME, "convention": "ipec"})
+    recipe = tiny_recipe(tmp_path, export)
+    assert not [client for client in recipe["clients"] if client.startswith("lerobot_")]
+    missing = recipe["clients_of_other_formats"]
+    assert {client for client, setting in missing.items() if setting == "export: {lerobot: {}}"} == {
+        "lerobot_act",
+        "lerobot_smolvla",
+        "lerobot_pi05",
+    }
+    assert sorted(client for one in export.datasets(tmp_path) for client in one.clients) == sorted(recipe["clients"])
+
+
 @pytest.mark.parametrize("convention", [None, "ipec", "openpi"])
 def test_a_client_without_its_format_is_named_with_the_setting_that_exports_it(
     convention: str | None, tmp_path: Path

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from math import ceil
 from pathlib import Path
@@ -49,6 +50,9 @@ class LeRobotConfig(FormatOptions):
             Versions of lerobot before 0.6 cannot read such a dataset.
         depth: Storage of the extra ``depth``: ``text`` is its PNG files in base64, ``video`` is lerobot's own depth in
             codes of 12 bits; ``text`` by default. Versions of lerobot before 0.6 cannot read ``video``.
+        convention: Names of the columns, and commands of the gripper: ``libero`` as in lerobot's LIBERO datasets, with
+            -1 (open) and 1 (closed), ``ipec`` as in IPEC-COMMUNITY's, with 1 (open) and 0 (closed), for lerobot's GR00T
+            and VLA-JEPA and for InternVLA-A1.5; ``libero`` by default.
     """
 
     name: Name = ""
@@ -60,6 +64,9 @@ class LeRobotConfig(FormatOptions):
     action: Action = Field(default="delta", exclude_if=lambda action: action == "delta")
     language: bool = Field(default=False, exclude_if=lambda language: not language)
     depth: Depth = Field(default="text", exclude_if=lambda depth: depth == "text")
+    convention: Literal["libero", "ipec"] = Field(
+        default="libero", exclude_if=lambda convention: convention == "libero"
+    )
 
     @field_validator("language")
     @classmethod
@@ -94,12 +101,24 @@ def _require_lerobot_06(content: str) -> None:
         )
 
 
-def _keys(convention: Convention, content: Content) -> dict[str, str]:
-    """Return the ``keys`` of a format under the names of v3.0."""
-    keys = {view: spec.lerobot_key for view, spec in content.cameras.items()} | convention.motion_keys
+def _keys(convention: Convention, content: Content, labels: str) -> dict[str, str]:
+    """Return the ``keys`` of a format, with the place of its ``labels``."""
+    keys = convention.views(content)
+    keys |= {name: convention.name(key) for name, key in convention.motion_keys.items()}
     for view in content.views:
         keys |= {f"{view}_{name}": convention.camera_column(view, name) for name in (*MATRICES, *MAPS, "boxes")}
-    return keys | {"provenance": "meta/provenance.parquet", "labels": "meta/episodes"}
+    return keys | {"provenance": "meta/provenance.parquet", "labels": labels}
+
+
+OPEN_IS_ONE = GripperSpec(open=1.0, close=0.0)
+"""The commands of the gripper in a convention with ``open_is_one``."""
+
+
+CLIENTS_V30 = {
+    "libero": ("lerobot_act", "lerobot_smolvla", "lerobot_pi05", "lerobot_pi0_fast", "lerobot_molmoact2"),
+    "ipec": (),
+}
+"""Convention to the clients of ``finetune.yaml`` that read it."""
 
 
 class LeRobot(Format[LeRobotConfig]):
@@ -122,11 +141,13 @@ class LeRobot(Format[LeRobotConfig]):
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
-    clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05", "lerobot_pi0_fast", "lerobot_molmoact2")
 
     def __init__(self, data: Path, options: LeRobotConfig, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
-        self.keys = _keys(self._convention, content)
+        self.keys = _keys(self._convention, content, "meta/episodes")
+        if self._convention.open_is_one:
+            self.gripper = OPEN_IS_ONE
+        self.clients = CLIENTS_V30[options.convention]
         self.step_s += DEPTH_MAP_S * content.area * len(self._convention.depth_videos(content))
 
     @property
@@ -136,7 +157,13 @@ class LeRobot(Format[LeRobotConfig]):
     @property
     def _convention(self) -> Convention:
         options = self.options
-        return Convention(options.frames, language=self.language, action=options.action, depth=options.depth)
+        return replace(
+            CONVENTIONS[options.convention],
+            frames=options.frames,
+            language=options.language,
+            action=options.action,
+            depth=options.depth,
+        )
 
     @property
     def depth_as_video(self) -> bool:
@@ -300,10 +327,9 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def __init__(self, data: Path, options: LeRobotV21Config, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
         self.convention = CONVENTIONS[options.convention]
-        self.keys = {name: self.convention.name(key) for name, key in _keys(self.convention, content).items()}
-        self.keys["labels"] = "meta/episodes.jsonl"
+        self.keys = _keys(self.convention, content, "meta/episodes.jsonl")
         if self.convention.open_is_one:
-            self.gripper = GripperSpec(open=1.0, close=0.0)
+            self.gripper = OPEN_IS_ONE
         self.clients = CLIENTS_V21[options.convention]
 
     def step_kb(self, sizes: StepSizes) -> float:

@@ -39,6 +39,7 @@ from pipeline.formats.lerobot.read import (
     VERSION_V21,
     copy_of,
     episode_files,
+    libero_gripper,
     opened_v21,
     read_lines,
     readable,
@@ -232,14 +233,18 @@ def _samples(root: Path, data: Any, convention: Convention, content: Content) ->
         copy = copy_of(root, row, replace(content, extras=extras), convention)
         for step in sampled(row["length"]):
             item = data[row["dataset_from_index"] + step]
-            for name, key in convention.motion_keys.items():
-                if not np.array_equal(item[key].numpy(), getattr(copy.episode, name)[step]):
+            for name, v30_key in convention.motion_keys.items():
+                key = convention.name(v30_key)
+                values = item[key].numpy()[None]
+                if convention.open_is_one and name in ("action", "action_absolute"):
+                    values = libero_gripper(values)
+                if not np.array_equal(values[0], getattr(copy.episode, name)[step]):
                     yield row[EPISODE_ID], key
-            for view, spec in content.cameras.items():
+            for view, column in convention.views(content).items():
                 # lerobot returns floats in [0, 1], channels first.
-                frame = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
+                frame = item[column].numpy().transpose(1, 2, 0) * 255
                 if np.abs(frame - copy.frame(view, step)).max() > SAME_LEVELS:
-                    yield row[EPISODE_ID], spec.lerobot_key
+                    yield row[EPISODE_ID], column
             for view, column in depth_videos.items():
                 depth_m = item[column].numpy()[0]
                 if np.abs(depth_m - copy.depth_m[view, step]).max() > SAME_DEPTH_M:
@@ -357,7 +362,7 @@ def _wrong_statistics_v21(root: Path, convention: Convention, content: Content) 
     """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
     yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(content))
-    views = [convention.name(view.lerobot_key) for view in content.cameras.values()]
+    views = convention.views(content).values()
     figures: dict[tuple[str, str], list[Any]] = {(view, name): [] for view in views for name in FIGURES}
     with (root / "meta" / "episodes_stats.jsonl").open() as lines:
         for line in lines:
@@ -400,7 +405,7 @@ def _wrong_modality(
         entries = modality[name].items()
         read = [(part, entry["start"], entry["end"], entry["original_key"]) for part, entry in entries]
         yield from unlike(dataset, {f"{name} of modality.json": read}, {f"{name} of modality.json": wanted})
-    views = {view: convention.name(spec.lerobot_key) for view, spec in content.cameras.items()}
+    views = convention.views(content)
     columns = {
         "video": {"primary_image": views["image"], **views},
         "annotation": {"human.action.task_description": "task_index"},

@@ -179,13 +179,17 @@ class Convention:
         return self.names.get(column, column)
 
     def camera_column(self, view: str, name: str) -> str:
-        """Return the column of v3.0 with a view's matrix, map or boxes.
+        """Return the column with a view's matrix, map or boxes.
 
         Depth as video has a name of lerobot's cameras, because lerobot passes no other images to policies.
         """
         if name == "depth" and self.depth == "video":
-            return f"{ALL_VIEWS[view].lerobot_key}_depth"
+            return f"{self.name(ALL_VIEWS[view].lerobot_key)}_depth"
         return camera_column(view, name)
+
+    def views(self, content: Content) -> dict[str, str]:
+        """Map the name of each view to its column."""
+        return {view: self.name(spec.lerobot_key) for view, spec in content.cameras.items()}
 
     def text_maps(self, content: Content) -> list[Extra]:
         """List the maps that are stored as text."""
@@ -198,9 +202,9 @@ class Convention:
         return {view: self.camera_column(view, "depth") for view in content.views}
 
     def pictures(self, content: Content) -> dict[str, str]:
-        """Map the name of each view, and of its depth if that is a video, to its column of v3.0."""
-        columns = {view: spec.lerobot_key for view, spec in content.cameras.items()}
-        return columns | {f"{view}_depth": column for view, column in self.depth_videos(content).items()}
+        """Map the name of each view, and of its depth if that is a video, to its column."""
+        depths = {f"{view}_depth": column for view, column in self.depth_videos(content).items()}
+        return self.views(content) | depths
 
     def videos(self, content: Content) -> dict[str, str]:
         """Return the part of ``pictures`` that is stored as videos."""
@@ -255,6 +259,7 @@ class Convention:
 
 
 CONVENTIONS = {
+    "libero": Convention("video"),
     "ipec": Convention(
         "video",
         "franka",
@@ -273,8 +278,9 @@ CONVENTIONS = {
         },
     ),
 }
-"""Conventions of public code. Neither has joint angles; under ``observation`` they would be a policy's input.
+"""Conventions of public code. The last two have no joint angles; under ``observation`` they would be a policy's input.
 
+* ``libero``: the convention of lerobot's own LIBERO sets, only in v3.0: one set, LIBERO's gripper.
 * ``ipec``: the convention of IPEC-COMMUNITY's ``libero_*_no_noops_1.0.0_lerobot``, which are not available here.
   ``openx2lerobot/openx_rlds.py`` and its ``libero_dataset_transform`` (Tavish9/any4lerobot at 6937315) generated them:
   a set for each suite, videos, 20 Hz, gripper 1 open and 0 closed. ``examples/simBenchmarks/LIBERO/train_files`` in

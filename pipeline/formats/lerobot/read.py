@@ -4,7 +4,6 @@ import base64
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
@@ -111,21 +110,23 @@ def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
 
 
 def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Convention) -> Copy:
-    """Read an episode, given its row of ``rows``."""
+    """Read an episode with LIBERO's gripper, given its row of ``rows``."""
     index, steps = row["episode_index"], row["length"]
     info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)
-    table = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
-    reject_others(table, row, row["dataset_from_index"])
+    stored = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
+    reject_others(stored, row, row["dataset_from_index"])
+    table = _v30_columns(stored, convention)
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
     if row["dataset_to_index"] != row["dataset_from_index"] + steps or row["tasks"] != [instructions[0]]:
         stated = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
         raise ValueError(f"episode {index} of {steps} steps, {instructions[0]!r}, {stated}")
     depth_columns = convention.depth_videos(content)
     videos, depth_videos = {}, {}
-    for view, spec in content.cameras.items():
-        if info["features"][spec.lerobot_key]["dtype"] == "video":
-            videos[view] = _video_place(root, info, row, spec.lerobot_key)
+    views = convention.views(content)
+    for view, column in views.items():
+        if info["features"][column]["dtype"] == "video":
+            videos[view] = _video_place(root, info, row, column)
         if view in depth_columns:
             depth_videos[view] = _video_place(root, info, row, depth_columns[view])
     times_s = table["timestamp"].to_pylist()
@@ -142,8 +143,8 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
         train=index < int(info["splits"]["train"].partition(":")[2]),
         statistics=Statistics(
             stored=_statistics(root, row),
-            numbers={name: matrix(table, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
-            views={view: spec.lerobot_key for view, spec in content.cameras.items()},
+            numbers={name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
+            views=views,
             quantiles=QUANTILE_NAMES,
             depth=depth_columns,
         ),
@@ -214,7 +215,7 @@ def reject_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
 def episode(
     table: pa.Table, row: Mapping[str, Any], instruction: str, content: Content, convention: Convention
 ) -> Episode:
-    """Return an episode, given v3.0's columns of its steps and its row of the files in ``meta/``.
+    """Return an episode with LIBERO's gripper, given v3.0's columns of its steps and its row of the files in ``meta/``.
 
     The episode has frames only where they are stored as image files.
     """
@@ -223,6 +224,8 @@ def episode(
         if spec.lerobot_key in table.column_names:
             frames[view] = [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
     motion = {name: matrix(table, key) for name, key in convention.motion_keys.items()}
+    if convention.open_is_one:
+        motion |= {name: libero_gripper(motion[name]) for name in ("action", "action_absolute")}
     return Episode(
         episode_id=row[EPISODE_ID],
         frames=frames,
@@ -238,6 +241,17 @@ def episode(
         rewrites=row["rewrites"],
         subtasks=subtasks_of(row["subtask_starts"], row["subtask_texts"]),
     )
+
+
+def libero_gripper(action: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Convert the gripper command of actions (T, 7) from 1 open, 0 close to LIBERO's -1 open, 1 close."""
+    return np.hstack([action[:, :-1], 1 - 2 * action[:, -1:]])
+
+
+def _v30_columns(stored: pa.Table, convention: Convention) -> pa.Table:
+    """Return the columns of a data file under the names of v3.0."""
+    v30_names = {name: v30_name for v30_name, name in convention.names.items()}
+    return stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
 
 
 def _steps(path: Path, first: int, steps: int) -> pa.Table:
@@ -375,12 +389,9 @@ def _copy_v21(
     instructions = [tasks[task] for task in stored["task_index"].to_pylist()]
     if row["tasks"] != [instructions[0]]:
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
-    v30_names = {name: v30_name for v30_name, name in convention.names.items()}
-    table = stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
+    table = _v30_columns(stored, convention)
     made = episode(table, row, instructions[0], content, convention)
-    if convention.open_is_one:
-        made = replace(made, action=_libero_gripper(made.action), action_absolute=_libero_gripper(made.action_absolute))
-    keys = {view: convention.name(spec.lerobot_key) for view, spec in content.cameras.items()}
+    keys = convention.views(content)
     videos = {
         view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"
     }
@@ -389,11 +400,6 @@ def _copy_v21(
     statistics = Statistics(_statistics_v21(root, index), numbers, keys)
     frames = decoded(table["timestamp"].to_pylist(), videos)
     return Copy(root.parent.name, made, instructions, frames, marks, {}, statistics=statistics)
-
-
-def _libero_gripper(action: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Convert the gripper command of actions (T, 7) from 1 open, 0 close to LIBERO's -1 open, 1 close."""
-    return np.hstack([action[:, :-1], 1 - 2 * action[:, -1:]])
 
 
 def _statistics_v21(root: Path, index: int) -> dict[str, Any]:

@@ -153,7 +153,7 @@ def planes(pixels: Frame) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2YUV_I420), np.uint8)
 
 
-# Content of an episode, under the names of v3.0.
+# Content of an episode.
 
 
 def _load_each(
@@ -249,7 +249,11 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, conven
 
 
 def _step_columns(episode: Episode, numbers: Numbers, convention: Convention, content: Content) -> dict[str, pa.Array]:
-    """Return the columns of an episode's steps, with its images if they are stored as such."""
+    """Return the columns of an episode's steps, with its images if they are stored as such.
+
+    Args:
+        numbers: the columns of numbers, under the names of v3.0.
+    """
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, geometry in episode.geometry.items():
         for extra in convention.text_maps(content):
@@ -266,7 +270,8 @@ def _step_columns(episode: Episode, numbers: Numbers, convention: Convention, co
             stored[name] = pa.array(values)
         else:
             stored[name] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
-    return stored | {name: pa.array(values) for name, values in texts.items()} | images
+    columns = stored | {name: pa.array(values) for name, values in texts.items()} | images
+    return {convention.name(name): values for name, values in columns.items()}
 
 
 def _picture_statistics(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
@@ -275,19 +280,19 @@ def _picture_statistics(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
 
 
 def _episode_statistics(
-    numbers: Numbers, levels: Mapping[str, Counts], columns: Mapping[str, str]
+    numbers: Numbers, levels: Mapping[str, Counts], convention: Convention, content: Content
 ) -> dict[str, dict[str, NDArray[Any]]]:
     """Compute lerobot's statistics of an episode by column: (D,) of numbers, (3, 1, 1) of frames; ``count`` is (1,).
 
     Args:
-        numbers: the columns of numbers.
-        levels: counts of levels by the names of ``columns``.
-        columns: ``Convention.pictures``.
+        numbers: the columns of numbers, under the names of v3.0.
+        levels: counts of levels by the names of ``Convention.pictures``.
     """
+    columns = convention.pictures(content)
     of_numbers = {}
     for name, values in numbers.items():
         rows = values.reshape(len(values), -1)
-        of_numbers[name] = describe(rows, QUANTILES) | {"count": np.array([len(values)])}
+        of_numbers[convention.name(name)] = describe(rows, QUANTILES) | {"count": np.array([len(values)])}
     steps = len(numbers["timestamp"])
     return of_numbers | {columns[name]: _picture_statistics(counts, steps) for name, counts in levels.items()}
 
@@ -342,7 +347,7 @@ def _write_common(
     for picture, column in convention.pictures(content).items():
         total = np.sum([levels[picture] for levels in levels_of_pieces], axis=0)
         steps = pieces[-1].first_step + pieces[-1].steps
-        figures[convention.name(column)] = _picture_statistics(total, steps)
+        figures[column] = _picture_statistics(total, steps)
     for name, description in columns.items():
         if description["dtype"] in ("float32", "int64"):
             figures[name] = _exact(root, name, description["shape"][0])
@@ -390,7 +395,7 @@ def _write_modality(root: Path, convention: Convention, content: Content) -> Non
         return {name: {"start": k, "end": k + 1, "original_key": column} for k, name in enumerate(names)}
 
     pose = ("x", "y", "z", "roll", "pitch", "yaw")
-    views = {view: convention.name(spec.lerobot_key) for view, spec in content.cameras.items()}
+    views = convention.views(content)
     videos = {"primary_image": views["image"], **views}
     modality = {
         "state": entries(convention.name(SCHEMA.state.lerobot_key), *pose, "pad", "gripper"),
@@ -454,7 +459,7 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, co
             data.write_table(table.cast(data.schema))
             row = _episode_row(episode, piece, index, first_step, convention.videos(content).values())
             # lerobot's tools for editing aggregate the statistics of the episodes.
-            for name, figures in _episode_statistics(numbers, levels, convention.pictures(content)).items():
+            for name, figures in _episode_statistics(numbers, levels, convention, content).items():
                 row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
             rows.append(row)
             summaries.append((_provenance_row(episode, index), levels))
@@ -554,8 +559,8 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
         for index, _, episode, numbers in _load_each(piece, load, convention, content):
             levels = _write_episode_v21(path, index, episode, numbers, convention, content)
             figures = {}
-            for name, all_figures in _episode_statistics(numbers, levels, convention.pictures(content)).items():
-                figures[convention.name(name)] = listed({figure: all_figures[figure] for figure in STATISTICS_V21})
+            for name, all_figures in _episode_statistics(numbers, levels, convention, content).items():
+                figures[name] = listed({figure: all_figures[figure] for figure in STATISTICS_V21})
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
             row |= {"episode_id": episode.episode_id, **labels_of(episode)}
             episodes.write(json.dumps(row) + "\n")
@@ -574,16 +579,15 @@ def _write_episode_v21(
 ) -> dict[str, Counts]:
     """Write the files of one episode and return the counts of levels of its views."""
     levels = {}
-    for view, spec in content.cameras.items():
+    for view, column in convention.views(content).items():
         if convention.frames == "video":
-            file = path / video_path_v21(index, convention.name(spec.lerobot_key))
+            file = path / video_path_v21(index, column)
             file.parent.mkdir(parents=True, exist_ok=True)
             with Video(file, content) as video:
                 levels[view] = _append_frames(episode, view, video)
         else:
             levels[view] = _append_frames(episode, view, None)
-    v30_columns = _step_columns(episode, numbers, convention, content)
-    columns = {convention.name(name): values for name, values in v30_columns.items()}
+    columns = _step_columns(episode, numbers, convention, content)
     schema = _data_schema_v21(convention, content)
     file = path / data_path_v21(index)
     file.parent.mkdir(parents=True, exist_ok=True)
