@@ -411,7 +411,7 @@ def gripper(case: Case) -> Iterator[Fault]:
 
 
 def flags(case: Case) -> Iterator[Fault]:
-    """Check the marks of the first and last step, and the reward, which only the last step of a success has.
+    """Check the marks of the first and last step, of success, and the reward, which only a success's last step has.
 
     Marks that a dataset does not have are skipped.
     """
@@ -420,6 +420,7 @@ def flags(case: Case) -> Iterator[Fault]:
         last = step == len(step) - 1
         marks = {"is_first": step == 0, "is_last": last, "discount": step >= 0}
         marks |= dict.fromkeys(("is_terminal", "reward"), last & case.row["kept"])
+        marks["is_success"] = np.full(len(step), case.row["kept"])
         yield from _marked(case, copy, marks)
 
 

@@ -3,23 +3,33 @@
 import json
 import shutil
 from contextlib import chdir
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from conftest import run_stages, tiny_config
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from synthetic import IDS, NAME, episode, episodes, loop
 
 from pipeline.config import load
+from pipeline.episode_schema import STANDARD
 from pipeline.files import checksum, read_json
+from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.registry import places
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run import manifest
 from pipeline.run.cleaning import PARTS
+from pipeline.run.export import export
 from pipeline.run.layout import DATASETS
 from pipeline.run.run import Run
 from pipeline.stages import write_inputs
+from pipeline.types import Episode, Scene, Trajectory, Verdict
+from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS
 from pipeline.validation.validate import EpisodesJob
 
 STAGES = ("inputs", "render", "exports", "manifest", "validate")
@@ -67,6 +77,16 @@ def test_each_format_has_the_failures_with_their_reason(asked: Path) -> None:
         listed = pq.read_table(file).to_pylist()
         assert {row["episode_id"]: (row["success"], row["reason"]) for row in listed} == said
         assert all(row["path_m"] > 0 for row in listed)
+        root = asked / "failures" / name
+        info = json.loads((root / "meta" / "info.json").read_text())
+        assert info["features"]["is_success"] == {"dtype": "bool", "shape": [1], "names": None}
+        marks = pq.read_table(root / "data", columns=["is_success"])
+        assert marks.schema.field("is_success").type == pa.bool_()
+        assert marks["is_success"].to_pylist() == [False] * info["total_frames"]
+    read = LeRobotDataset("failures", root=asked / "failures" / "lerobot" / "tiny_failures", video_backend="pyav")
+    assert not any(read[step]["is_success"].item() for step in (0, len(read) - 1))
+    info = json.loads((asked / "lerobot" / "tiny" / "meta" / "info.json").read_text())
+    assert "is_success" not in info["features"]
 
 
 def features_of(folder: Path) -> Any:
@@ -93,6 +113,29 @@ def test_validate_checks_them_and_finds_a_success_among_them(asked: Path, tmp_pa
         found = job([missed[0] | places(sets)[missed[0]["episode_id"]]]).findings
     told = {check: {fault.dataset for fault in faults} for check, faults in found.items() if faults}
     assert told == {"provenance": {"lerobot"}}
+
+
+def test_another_mark_of_success_is_found(tmp_path: Path) -> None:
+    content = STANDARD.including("outcome")
+    for target in (
+        LeRobot(tmp_path, LeRobotConfig(name=NAME, shards=1), content),
+        LeRobotV21(tmp_path, LeRobotV21Config(name=NAME, convention="ipec"), content),
+    ):
+        export(target, episodes(of_failure), loop)
+        row = {**of_failure(IDS[0]).provenance, "kept": False}
+        none = np.zeros((0, 0), np.float32)
+        replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), np.zeros(0), np.zeros(0), none, Verdict(False, ""))
+        copy = target.read(row, tmp_path)
+        assert copy is not None
+        assert list(CHECKS["flags"](Case(row, of_failure(IDS[0]), replay, [copy], None))) == []
+        (fault,) = CHECKS["flags"](Case(row | {"kept": True}, of_failure(IDS[0]), replay, [copy], None))
+        assert (fault.dataset, fault.what) == (target.name, "is_success of step 0 is 0")
+
+
+def of_failure(episode_id: str) -> Episode:
+    """Return a synthetic episode with the outcome of a failure."""
+    source = episode(episode_id)
+    return replace(source, provenance={**source.provenance, "success": False, "reason": "goal_not_reached"})
 
 
 def test_a_damaged_set_of_failures_leaves_the_record_of_the_others(asked: Path, tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ class LeRobot(Format[LeRobotConfig]):
     title: ClassVar = "LeRobot"
     options_type: ClassVar = LeRobotConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 12
+    recipe: ClassVar = 13
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     held_out_place: ClassVar = (
         "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless it is restricted "
@@ -314,7 +314,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     name: ClassVar = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
     options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
-    recipe: ClassVar = 6
+    recipe: ClassVar = 7
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     held_out_place: ClassVar = "are separate sets, whose names end in `_val`."
     maps_stored_as: ClassVar = MAPS_STORED_AS

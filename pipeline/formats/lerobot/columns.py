@@ -29,6 +29,10 @@ INSTANCES, OBJECT_POSES = "instances", "object_poses"
 """Columns of extras: a JSON list of names in ``meta/provenance.parquet``, and the poses of the named objects in every
 frame."""
 
+IS_SUCCESS = "is_success"
+"""A column of every frame in datasets of failures: whether the episode reached its goal. RLinf's RECAP requires it
+(``compute_returns.py`` in RLinf/RLinf at a3816b5)."""
+
 ENTRIES = 16
 """Number of a column's entries that are in memory at a time: 300 MB for 28,000 episodes."""
 
@@ -240,6 +244,8 @@ class Convention:
             columns |= {camera_column(view, "boxes"): _flat(SCHEMA.boxes) for view in content.views}
         if "object_poses" in content.extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
+        if "outcome" in content.extras:
+            columns[IS_SUCCESS] = {"dtype": "bool", "shape": (1,), "names": None}
         if self.language:
             columns |= {name: {"dtype": "language", "shape": (1,), "names": None} for name in (LANGUAGE, EVENTS)}
         columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}

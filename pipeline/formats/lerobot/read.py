@@ -22,6 +22,7 @@ from pipeline.formats.lerobot.columns import (
     EPISODE_ID,
     EVENTS,
     INSTANCES,
+    IS_SUCCESS,
     LANGUAGE,
     OBJECT_POSES,
     Convention,
@@ -49,8 +50,8 @@ UNREADABLE = (
 )
 """Exceptions on files that are damaged, missing or do not belong together."""
 
-MARKS = ("frame_index", "timestamp")
-"""LeRobot's columns that distinguish steps."""
+MARKS = ("frame_index", "timestamp", IS_SUCCESS)
+"""Columns of ``Copy.marks``; only datasets of failures have the last one."""
 
 NUMBERS = ("float32", "int64")
 """Types of the columns that have statistics, in addition to frames."""
@@ -136,7 +137,7 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
         episode=episode(table, row, instructions[0], content, convention),
         instructions=instructions,
         decoded=decoded(times_s, videos),
-        marks={name: table[name].to_numpy() for name in MARKS},
+        marks=_marks(table),
         place={"lerobot_episode_index": index},
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
         events=table[EVENTS].to_pylist() if EVENTS in table.column_names else None,
@@ -252,6 +253,10 @@ def _v30_columns(stored: pa.Table, convention: Convention) -> pa.Table:
     """Return the columns of a data file under the names of v3.0."""
     v30_names = {name: v30_name for v30_name, name in convention.names.items()}
     return stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
+
+
+def _marks(table: pa.Table) -> dict[str, NDArray[Any]]:
+    return {name: table[name].to_numpy() for name in MARKS if name in table.column_names}
 
 
 def _steps(path: Path, first: int, steps: int) -> pa.Table:
@@ -395,11 +400,10 @@ def _copy_v21(
     videos = {
         view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"
     }
-    marks = {name: table[name].to_numpy() for name in MARKS}
     numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
     statistics = Statistics(_statistics_v21(root, index), numbers, keys)
     frames = decoded(table["timestamp"].to_pylist(), videos)
-    return Copy(root.parent.name, made, instructions, frames, marks, {}, statistics=statistics)
+    return Copy(root.parent.name, made, instructions, frames, _marks(table), {}, statistics=statistics)
 
 
 def _statistics_v21(root: Path, index: int) -> dict[str, Any]:

@@ -48,6 +48,7 @@ from pipeline.formats.lerobot.columns import (
     FILE_MB,
     FILES_OF_A_CHUNK,
     INSTANCES,
+    IS_SUCCESS,
     OBJECT_POSES,
     PLACE,
     VIDEO_INFO,
@@ -270,6 +271,8 @@ def _step_columns(episode: Episode, numbers: Numbers, convention: Convention, co
             stored[name] = pa.array(values)
         else:
             stored[name] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+    if "outcome" in content.extras:
+        stored[IS_SUCCESS] = pa.array([episode.provenance["success"]] * len(episode))
     columns = stored | {name: pa.array(values) for name, values in texts.items()} | images
     return {convention.name(name): values for name, values in columns.items()}
 
