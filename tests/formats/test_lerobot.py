@@ -20,6 +20,8 @@ from synthetic import IDS, MATRICES, REPO, episode, write_lerobot
 
 from pipeline.episode_schema import SCHEMA, Content
 from pipeline.formats import lerobot as lerobot_format
+from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.lerobot.columns import FILE_MB
 from pipeline.formats.lerobot.write import Video
 
 
@@ -71,6 +73,18 @@ def test_lerobot_reads_and_merges_many_files(tmp_path: Path, frames: str) -> Non
         # Merging finds the files by what the rows of meta/episodes say.
         lerobot.datasets.aggregate.aggregate_datasets([REPO], REPO, roots=[target.root], aggr_root=tmp_path / "again")
         assert_lerobot_episodes(tmp_path / "again", exact=frames == "images")
+
+
+@pytest.mark.parametrize("views", [("image", "wrist_image"), ("image", "wrist_image", "front_image", "side_image")])
+def test_a_video_file_has_almost_the_stated_size(views: tuple[str, ...], tmp_path: Path) -> None:
+    """Each view has its own file, so the number of views does not change the steps of a file."""
+    known = {f"episode-{k}": Known("libero_spatial", demo=f"task/demo_{k}", steps=100) for k in range(3000)}
+    target = lerobot_format.LeRobot(tmp_path, lerobot_format.LeRobotConfig(name=REPO), Content(views=views))
+    pieces = target.pieces(Episodes(known, episode))
+    measured_kb = 6.7  # The mean frame of ``benchmarks/video_quality.py``.
+    sizes_mb = [piece.steps * measured_kb / 1000 for piece in pieces]
+    assert len(pieces) == 12
+    assert 0.75 * FILE_MB < min(sizes_mb) <= max(sizes_mb) < FILE_MB
 
 
 def test_lerobot_provenance_has_a_row_for_each_episode(written: Written) -> None:

@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
 from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, number_pieces, split
-from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, Action, Convention, Depth
+from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, VIEW_AS_VIDEO_KB, Action, Convention, Depth
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
 from pipeline.tables import column
@@ -128,7 +128,7 @@ class LeRobot(Format[LeRobotConfig]):
     title: ClassVar = "LeRobot"
     options_type: ClassVar = LeRobotConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 13
+    recipe: ClassVar = 14
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     held_out_place: ClassVar = (
         "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless it is restricted "
@@ -195,16 +195,17 @@ class LeRobot(Format[LeRobotConfig]):
         return {self.options.name}
 
     def _steps_of_a_file(self) -> int:
-        """Return the number of steps in a file of ``FILE_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
+        """Return the number of steps in a file of ``FILE_MB``, of data of all views or a video of one view.
+
+        The sizes are those of ``benchmarks/disk.py``, rounded up.
+        """
         views = len(self.content.views) * self.content.area
         text_maps = self._convention.text_maps(self.content)
         maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in text_maps)
         images_kb = 40.0 if self.options.frames == "images" else 0.0
         data_kb = 0.5 + views * (maps_kb + images_kb)
-        video_kb = 6.0 * views
-        if self.depth_as_video:
-            video_kb = max(video_kb, DEPTH_MAP_KB * self.content.area)
-        return int(1000 * FILE_MB / max(data_kb, video_kb))
+        view_kb = DEPTH_MAP_KB if self.depth_as_video else VIEW_AS_VIDEO_KB
+        return int(1000 * FILE_MB / max(data_kb, view_kb * self.content.area))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats.lerobot import write
