@@ -66,6 +66,30 @@ def test_v21_has_the_conventions_names_and_gripper(convention: str, tmp_path: Pa
     assert b'"List"' not in pq.read_schema(root / info["data_path"].format(**place)).metadata[b"huggingface"]
 
 
+def test_starvla_finds_the_statistics_that_it_would_compute(tmp_path: Path) -> None:
+    """By ``calculate_dataset_statistics`` and ``_load_stats_cache`` of its loader at 0ed0aad."""
+    root = write_lerobot_v21(tmp_path, "ipec").folder / SET
+    cache = json.loads((root / "meta" / "stats_gr00t.json").read_text())
+    assert (cache["__format_version"], cache["__cache_config"]) == (2, {"mode": "abs"})
+    modality = json.loads((root / "meta" / "modality.json").read_text())
+    named = {entry["original_key"] for kind in ("state", "action") for entry in modality[kind].values()}
+    assert cache["statistics"].keys() == named == {"observation.state", "action"}
+    frames = [pq.read_table(file) for file in sorted(root.glob("data/*/*.parquet"))]
+    for column, figures in cache["statistics"].items():
+        rows = [row for frame in frames for row in frame[column].to_pylist()]
+        values = np.vstack([np.asarray(row, dtype=np.float32) for row in rows])
+        expected = {name: getattr(np, name)(values, axis=0) for name in ("mean", "std", "min", "max")}
+        expected |= {"q01": np.quantile(values, 0.01, axis=0), "q99": np.quantile(values, 0.99, axis=0)}
+        assert figures.keys() == expected.keys()
+        for name, figure in expected.items():
+            np.testing.assert_allclose(figures[name], figure, atol=1e-5, err_msg=f"{name} of {column}")
+
+
+def test_openpi_has_no_files_of_starvla(tmp_path: Path) -> None:
+    meta = write_lerobot_v21(tmp_path, "openpi").folder / REPO / "meta"
+    assert not {"modality.json", "stats_gr00t.json"} & {file.name for file in meta.iterdir()}
+
+
 def assert_close(found: Mapping[str, Any], values: NDArray[Any]) -> None:
     assert set(found) == {"min", "max", "mean", "std", "count"}
     for name in ("min", "max", "mean", "std"):

@@ -188,6 +188,7 @@ def another(value: Any) -> Any:
         ("lerobot_v21", "meta/episodes.jsonl"),
         ("lerobot_v21", "meta/tasks.jsonl"),
         ("lerobot_v21", "meta/modality.json"),
+        ("lerobot_v21", "meta/stats_gr00t.json"),
         ("rlds", "dataset_info.json"),
     ],
 )

@@ -315,7 +315,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     name: ClassVar = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
     options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
-    recipe: ClassVar = 7
+    recipe: ClassVar = 8
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     held_out_place: ClassVar = "are separate sets, whose names end in `_val`."
     maps_stored_as: ClassVar = MAPS_STORED_AS

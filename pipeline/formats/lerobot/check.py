@@ -28,6 +28,8 @@ from pipeline.formats.lerobot.columns import (
     FILE_MB,
     FILES_OF_A_CHUNK,
     PLACE,
+    STARVLA_FIGURES,
+    STARVLA_STATISTICS,
     VIDEO_PATH,
     VIDEO_PATH_V21,
     Convention,
@@ -284,8 +286,8 @@ def check_v21(
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
-    The check covers every field of ``meta/info.json`` and ``modality.json``, the tasks, the splits, the files of every
-    episode, and the videos' own properties. It computes the statistics of all columns again.
+    The check covers every field of ``meta/info.json``, ``modality.json`` and ``stats_gr00t.json``, the tasks, the
+    splits, the files of every episode, and the videos' own properties. It computes the statistics of all columns again.
 
     Raises:
         PipelineError: when a set cannot be opened.
@@ -353,6 +355,7 @@ def _format_v21(root: Path, convention: Convention, content: Content) -> Iterato
     yield from _wrong_tasks(dataset, tasks, [row["tasks"][0] for row in rows.values()])
     if convention.open_is_one:
         yield from _wrong_modality(dataset, root, columns, convention, content)
+        yield from _wrong_starvla_statistics(dataset, root, convention)
     # The videos of a set are alike: only the first of each view is opened here. Reading episodes decodes frames of all.
     for key in videos:
         yield from _wrong_video(dataset, root / video_path_v21(indices[0], key), info["features"][key]["info"])
@@ -417,6 +420,18 @@ def _wrong_modality(
 
 
 _PARTS = ("state", "action", "video", "annotation")
+
+
+def _wrong_starvla_statistics(dataset: str, root: Path, convention: Convention) -> Iterator[Fault]:
+    """Compare starVLA's statistics with ``meta/stats.json``, which is compared with the data files."""
+    stats = json.loads((root / "meta" / "stats.json").read_text())
+    stored = json.loads((root / "meta" / STARVLA_STATISTICS).read_text())
+    wanted = {"__format_version": 2, "__cache_config": {"mode": "abs"}}
+    yield from unlike(dataset, stored, wanted, f"{STARVLA_STATISTICS}: ")
+    for spec in (SCHEMA.state, SCHEMA.action):
+        column = convention.name(spec.lerobot_key)
+        figures = {name: stats[column][name] for name in STARVLA_FIGURES}
+        yield from unlike(dataset, stored["statistics"], {column: figures}, f"{STARVLA_STATISTICS}: ")
 
 
 def _wrong_video(dataset: str, file: Path, stated: Mapping[str, Any]) -> Iterator[Fault]:

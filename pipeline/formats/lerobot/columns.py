@@ -29,6 +29,14 @@ INSTANCES, OBJECT_POSES = "instances", "object_poses"
 """Columns of extras: a JSON list of names in ``meta/provenance.parquet``, and the poses of the named objects in every
 frame."""
 
+STARVLA_STATISTICS = "stats_gr00t.json"
+"""File of ``meta/`` from which starVLA takes the statistics of states and actions; it ignores ``stats.json``. Without
+the file, it reads every column of all data files and writes it (``starVLA/dataloader/gr00t_lerobot/datasets.py`` at
+0ed0aad)."""
+
+STARVLA_FIGURES = ("mean", "std", "min", "max", "q01", "q99")
+"""Statistics in this file. starVLA computes them as NumPy does by default, as in ``stats.json``, but in float32."""
+
 IS_SUCCESS = "is_success"
 """A column of every frame in datasets of failures: whether the episode reached its goal. RLinf's RECAP requires it
 (``compute_returns.py`` in RLinf/RLinf at a3816b5)."""

@@ -51,6 +51,8 @@ from pipeline.formats.lerobot.columns import (
     IS_SUCCESS,
     OBJECT_POSES,
     PLACE,
+    STARVLA_FIGURES,
+    STARVLA_STATISTICS,
     VIDEO_INFO,
     VIDEO_PATH,
     VIDEO_PATH_V21,
@@ -409,6 +411,20 @@ def _write_modality(root: Path, convention: Convention, content: Content) -> Non
     _write_json(root / "meta" / "modality.json", modality)
 
 
+def _write_starvla_statistics(root: Path, convention: Convention) -> None:
+    """Write the part of ``meta/stats.json`` that starVLA normalises by, in the form of its cache.
+
+    InternVLA-M1 and DiT4DiT have another form of a file of this name. They reject this one and write theirs over it.
+    """
+    stats = json.loads((root / "meta" / "stats.json").read_text())
+    statistics = {}
+    for spec in (SCHEMA.state, SCHEMA.action):
+        column = convention.name(spec.lerobot_key)
+        statistics[column] = {figure: stats[column][figure] for figure in STARVLA_FIGURES}
+    content = {"__format_version": 2, "__cache_config": {"mode": "abs"}, "statistics": statistics}
+    _write_json(root / "meta" / STARVLA_STATISTICS, content)
+
+
 def _link(made: Path, place: Path) -> None:
     """Link a file to a second place; the first place stays, for a call that resumes where this one was killed."""
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -620,6 +636,7 @@ def finish_v21(work: Path, root: Path, pieces: Sequence[Piece], convention: Conv
     (root / "meta" / "tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     if convention.open_is_one:
         _write_modality(root, convention, content)
+        _write_starvla_statistics(root, convention)
     totals = _totals("v2.1", pieces[-1], len(tasks), convention)
     episodes, videos = totals["total_episodes"], convention.frames == "video"
     info = {
