@@ -20,7 +20,7 @@ from synthetic import IDS, MATRICES, REPO, episode, write_lerobot
 
 from pipeline.episode_schema import SCHEMA, Content
 from pipeline.formats import lerobot as lerobot_format
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.lerobot.columns import FILE_MB
 from pipeline.formats.lerobot.write import Video
 
@@ -78,7 +78,7 @@ def test_lerobot_reads_and_merges_many_files(tmp_path: Path, frames: str) -> Non
 @pytest.mark.parametrize("views", [("image", "wrist_image"), ("image", "wrist_image", "front_image", "side_image")])
 def test_a_video_file_has_almost_the_stated_size(views: tuple[str, ...], tmp_path: Path) -> None:
     """Each view has its own file, so the number of views does not change the steps of a file."""
-    known = {f"episode-{k}": Known("libero_spatial", demo=f"task/demo_{k}", steps=100) for k in range(3000)}
+    known = {f"episode-{k}": EpisodeFacts("libero_spatial", demo=f"task/demo_{k}", steps=100) for k in range(3000)}
     target = lerobot_format.LeRobot(tmp_path, lerobot_format.LeRobotConfig(name=REPO), Content(views=views))
     pieces = target.pieces(Episodes(known, episode))
     measured_kb = 6.7  # The mean frame of ``benchmarks/video_quality.py``.

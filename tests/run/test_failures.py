@@ -125,7 +125,7 @@ def test_another_mark_of_success_is_found(tmp_path: Path) -> None:
         row = {**of_failure(IDS[0]).provenance, "kept": False}
         none = np.zeros((0, 0), np.float32)
         replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), np.zeros(0), np.zeros(0), none, Verdict(False, ""))
-        copy = target.read(row, tmp_path)
+        copy = target.read(row)
         assert copy is not None
         assert list(CHECKS["flags"](Case(row, of_failure(IDS[0]), replay, [copy], None))) == []
         (fault,) = CHECKS["flags"](Case(row | {"kept": True}, of_failure(IDS[0]), replay, [copy], None))
