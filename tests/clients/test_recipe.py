@@ -25,7 +25,7 @@ from vla_eval.model_servers.base import ModelServer
 from pipeline.clients.recipe import build, write
 from pipeline.export_config import ExportConfig
 from pipeline.files import schema_file
-from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot import CLIENTS_V30
 
 
 def evaluated_here(recipe: dict[str, Any]) -> dict[str, Any]:
@@ -74,11 +74,8 @@ def test_policies_of_lerobot_are_left_out_where_the_gripper_is_not_that_of_their
     recipe = tiny_recipe(tmp_path, export)
     assert not [client for client in recipe["clients"] if client.startswith("lerobot_")]
     missing = recipe["clients_of_other_formats"]
-    assert {client for client, setting in missing.items() if setting == "export: {lerobot: {}}"} == {
-        "lerobot_act",
-        "lerobot_smolvla",
-        "lerobot_pi05",
-    }
+    named = {client for client, setting in missing.items() if setting == "export: {lerobot: {}}"}
+    assert named == {*CLIENTS_V30["libero"]}
     assert sorted(client for one in export.datasets(tmp_path) for client in one.clients) == sorted(recipe["clients"])
 
 
@@ -191,7 +188,7 @@ def test_the_evaluation_of_each_trained_policy_is_understood_by_both_programs(tm
     export = export_config(lerobot_openpi={"name": NAME, "validation": 0.1})
     recipe = tiny_recipe(tmp_path, export)
     evaluated = evaluated_here(recipe)
-    assert evaluated.keys() == {"openvla_oft", "openpi", *LeRobot.clients}
+    assert evaluated.keys() == {"openvla_oft", "openpi", *CLIENTS_V30["libero"]}
     for commands in evaluated.values():
         words = shlex.split(commands["command"])
         assert words[:3] == ["python", "-m", "pipeline"]
@@ -227,7 +224,7 @@ def test_policies_of_own_tasks_are_evaluated_on_these(tmp_path: Path) -> None:
     assert "N is the number of control steps" in recipe["evaluation"]["own_tasks"]
 
 
-@pytest.mark.parametrize("client", LeRobot.clients)
+@pytest.mark.parametrize("client", CLIENTS_V30["libero"])
 def test_pypi_has_the_extras_that_a_client_needs(client: str, tmp_path: Path) -> None:
     """pip only warns of a missing extra. An extra of lerobot's repository has an address after it."""
     lerobot = metadata("lerobot")
