@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import BOWL, copy_of, dvc, in_a_clone, tiny_config
+from conftest import BOWL, copy_of, dvc, in_a_clone, run_stages, tiny_config
 from kills import contents
 
 from pipeline import gl
@@ -20,6 +20,9 @@ from pipeline.validation.validate import validate
 
 SEED = 2
 """Under it, the camera of the first candidate of layout and camera together shows nothing of the added object."""
+
+LATER = ("render", "exports", "manifest")
+"""Stages after ``replay``."""
 
 
 def reserved(demos: Path) -> dict[str, object]:
@@ -49,9 +52,9 @@ def reject_frames_of_first_candidate(clone: Path, fields: dict[str, object]) -> 
             RenderJob(row, streams, *folders, config.render, gl.choose().device).lost()
 
 
-def made(clone: Path, target: str, *options: str) -> list[str]:
+def made(clone: Path, target: str) -> list[str]:
     """Run a DVC target; returns the stages that were started."""
-    done = dvc(clone, "repro", target, *options)
+    done = dvc(clone, "repro", target)
     assert done.returncode == 0, done.stdout + done.stderr
     prefix = "Running stage '"
     return [line.removeprefix(prefix)[:-2] for line in done.stdout.splitlines() if line.startswith(prefix)]
@@ -71,21 +74,22 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
     clone = tmp_path / "clone"
     fields = reserved(short_demos)
     in_a_clone(fields, clone)
-    for name in ("configuration.json", "machine.json", ".finished/doctor.json"):  # The machine was tried for that run.
+    for name in ("configuration.json", "machine.json", ".finished/trial.json"):  # The machine was tried for that run.
         copy_of(f"data/tiny/{name}", finished.parent.parent, clone)
-    made(clone, "replay")
+    run_stages(clone, fields, ["inputs", "doctor", "plan", "leakage", "replay"])
     replayed = set((clone / "data/tiny/trajectories").glob("*.npz"))
     assert len(replayed) == 3, "the twin and the first candidates"
     reject_frames_of_first_candidate(clone, fields)
-    made(clone, "manifest")
+    run_stages(clone, fields, LATER)
     rows = manifest.read(clone / "data/tiny/manifest.parquet")
     lost = ["worker_lost", "kept", "reserve_not_needed"]
     unseen = ["added_objects_not_seen", "kept", "reserve_not_needed"]
     assert remains(rows) == {"clean": ["kept"], "layout": lost, "layout+camera": unseen}
     exported = Counter(row["axis"] for row in rows if row["rlds_shard"] and row["lerobot_episode_index"] is not None)
     assert exported == {"clean": 1, "layout": 1, "layout+camera": 1}
-    before = contents(clone)
 
+    assert made(clone, "manifest")[-1] == "manifest", "DVC has called no stage yet"
+    before = contents(clone)
     assert made(clone, "manifest") == ["inputs"]
     assert contents(clone) == before
 
@@ -98,11 +102,11 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
         for file in (clone / "data/tiny/frames" / reserve.stem).iterdir():
             file.unlink()
     (clone / "data/tiny/frames/index.parquet").unlink()
-    made(clone, "manifest")
+    run_stages(clone, fields, ["inputs", *LATER])
     assert contents(clone) == before
 
     # A replay stage that starts again, as after an edit of its code, leaves the reserves to the stage that needs them.
-    made(clone, "replay", "--force", "--single-item")
+    run_stages(clone, fields, ["replay"])
     assert all(reserve.exists() for reserve in reserves)
 
     monkeypatch.chdir(clone)
