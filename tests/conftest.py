@@ -329,10 +329,10 @@ def _run_in_clone(short_demos: Path, clone: Path) -> None:
 
 
 def copy_of(name: str, source: Path, target: Path) -> None:
-    """Copy a file or a folder to the same place below another folder."""
+    """Copy a file or a folder to the same place below another folder, with its compiled code."""
     (target / name).parent.mkdir(parents=True, exist_ok=True)
     if (source / name).is_dir():
-        shutil.copytree(source / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(source / name, target / name)
     else:
         shutil.copy(source / name, target / name)
 
