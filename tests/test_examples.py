@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 import subprocess
 import sys
 from collections import Counter
@@ -30,11 +31,15 @@ def kept(run: Path) -> list[dict[str, object]]:
 @pytest.mark.parametrize(
     "example", ["add_axis", "back_project", "load_lerobot", "load_rlds", "read_manifest", "rotation_6d"]
 )
-def test_an_example_without_a_folder_says_what_it_needs(example: str) -> None:
+def test_an_example_without_a_folder_says_what_it_needs(
+    example: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = REPOSITORY / "examples" / f"{example}.py"
-    done = subprocess.run([sys.executable, file], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.endswith(f"{file.name}: error: the following arguments are required: run\n")
+    monkeypatch.setattr(sys, "argv", [str(file)])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(file), run_name="__main__")
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith(f"{file.name}: error: the following arguments are required: run\n")
 
 
 def test_load_rlds(finished: Path) -> None:
