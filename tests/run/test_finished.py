@@ -139,11 +139,11 @@ def test_a_lost_shard_is_made_again_and_a_damaged_trajectory_once_it_is_moved_aw
     before = shard.read_bytes(), trajectory.read_bytes()
     shard.unlink()
     trajectory.write_bytes(before[1][: len(before[1]) // 2])
-    stopped = dvc(clone, "repro")
+    stopped = dvc(clone, "repro", "exports")
     assert stopped.returncode != 0
     assert f"{trajectory.name}: the file is damaged" in stopped.stdout + stopped.stderr
     assert len(trajectory.read_bytes()) == len(before[1]) // 2
     trajectory.rename(clone / trajectory.name)
-    done = dvc(clone, "repro")
+    done = dvc(clone, "repro", "exports")
     assert done.returncode == 0, done.stdout + done.stderr
     assert (shard.read_bytes(), trajectory.read_bytes()) == before
