@@ -1,9 +1,6 @@
 """lerobot, as it is installed, streams a dataset and changes its features."""
 
-import os
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -63,29 +60,6 @@ def test_adds_and_removes_a_feature(root: Path, tmp_path: Path) -> None:
             assert changed[index]["task"] == dataset[index]["task"]
             for key in KEYS:
                 np.testing.assert_array_equal(changed[index][key].numpy(), dataset[index][key].numpy())
-
-
-def test_act_trains_by_the_recipes_command_without_a_network(root: Path, tmp_path: Path) -> None:
-    """With proxies that no one answers, and without any downloaded weights."""
-    manifest = tmp_path / "manifest"
-    manifest.touch()
-    clients = recipe.build(manifest, [], ExportConfig.model_validate({"lerobot": LeRobotConfig(name=NAME)}))["clients"]
-    command = clients["lerobot_act"]["command"].replace("$DATA/lerobot/" + NAME, str(root))
-    for given, quick in (("--batch_size=8", "--batch_size=2"), ("--steps=100000", "--steps=1 --num_workers=0")):
-        assert given in command
-        command = command.replace(given, quick)
-    program, *words = shlex.split(command)
-    assert program == "lerobot-train"
-    empty, nobody = tmp_path / "empty", "http://127.0.0.1:9"
-    environment = {
-        **{name: value for name, value in os.environ.items() if not name.startswith(("HF_", "TORCH_"))},
-        **dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "http_proxy", "https_proxy"), nobody),
-        **dict.fromkeys(("HOME", "HF_HOME", "TORCH_HOME", "XDG_CACHE_HOME"), str(empty)),
-    }
-    trainer = Path(sys.executable).with_name(program)
-    arguments = ["--output_dir", str(tmp_path / "trained"), "--policy.device=cpu"]
-    subprocess.run([trainer, *words, *arguments], env=environment, check=True, timeout=600)
-    assert [*(tmp_path / "trained").rglob("model.safetensors")]
 
 
 def test_the_recipes_leave_depth_videos_out_of_the_inputs(tmp_path: Path) -> None:
