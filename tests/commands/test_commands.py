@@ -203,11 +203,19 @@ def configured(clone: Path, **sections: Any) -> None:
     file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
 
 
-def test_status_says_what_is_kept_and_what_would_run(clone: Path, finished: Path, short_demos: Path) -> None:
+def test_status_says_what_is_kept_and_what_would_run(
+    clone: Path,
+    finished: Path,
+    short_demos: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(clone)
+
     def status() -> str:
-        done = call(clone, "status", "configs/tiny.yaml")
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        monkeypatch.setattr(sys, "argv", ["pipeline", "status", "configs/tiny.yaml"])
+        assert main() == 0
+        return capsys.readouterr().out
 
     def would_run(printed: str) -> list[str]:
         lines = [line.strip() for line in printed.splitlines()]
