@@ -2,6 +2,7 @@
 
 import copy
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,8 +102,8 @@ def test_draws_that_a_plan_has_are_drawn_anew(tmp_path: Path) -> None:
     environment.close()
 
 
-def pixels_of(thing: str, camera: Perturbation, environment: EpisodeEnvironment) -> int:
-    """How many pixels of the agent view show a thing from a camera, by MuJoCo's own segmentation."""
+def pixels_of(things: Sequence[str], camera: Perturbation, environment: EpisodeEnvironment) -> list[int]:
+    """How many pixels of the agent view show each thing from a camera, by MuJoCo's own segmentation."""
     assert isinstance(camera, CameraPerturbation)
     model = copy.copy(environment.simulator.model)
     camera.apply(model)
@@ -115,8 +116,8 @@ def pixels_of(thing: str, camera: Perturbation, environment: EpisodeEnvironment)
     renderer.update_scene(data, "agentview")
     number, kind = np.moveaxis(renderer.render(), -1, 0)
     renderer.close()
-    geoms = number[kind == mujoco.mjtObj.mjOBJ_GEOM]
-    return int((model.body_rootid[model.geom_bodyid[geoms]] == model.body(f"{thing}_main").id).sum())
+    roots = model.body_rootid[model.geom_bodyid[number[kind == mujoco.mjtObj.mjOBJ_GEOM]]]
+    return [int((roots == model.body(f"{thing}_main").id).sum()) for thing in things]
 
 
 @pytest.mark.slow
@@ -129,10 +130,10 @@ def test_a_held_out_camera_that_does_not_show_what_the_task_is_about_is_sampled_
     assert progress.reason == "running"
     (used,) = environment.perturbations
     environment.image("agentview")  # which sets OpenGL up
-    assert pixels_of("plate_2", draw(task, 0), environment) == 0
+    assert pixels_of(["plate_2"], draw(task, 0), environment) == [0]
     assert used != draw(task, 0)
     assert (used.axis, used.level) == ("camera", 5)
     assert used in [draw(task, 0, attempt) for attempt in range(own_draws.ATTEMPTS)]
-    for thing in ("porcelain_mug_1", "white_yellow_mug_1", "plate_1", "plate_2"):
-        assert pixels_of(thing, used, environment) >= 20
+    things = ("porcelain_mug_1", "white_yellow_mug_1", "plate_1", "plate_2")
+    assert min(pixels_of(things, used, environment)) >= 20
     environment.close()
