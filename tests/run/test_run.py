@@ -235,7 +235,7 @@ def test_lerobots_own_training_runs_on_it_without_a_network(finished: Path, tmp_
         **dict.fromkeys(("HOME", "HF_HOME", "TORCH_HOME", "XDG_CACHE_HOME"), str(empty)),
     }
     trained = tmp_path / "trained"
-    arguments = [SCRIPTS / program, *words, "--output_dir", str(trained), "--policy.device=cpu"]
+    arguments = [str(SCRIPTS / program), *words, "--output_dir", str(trained), "--policy.device=cpu"]
     done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr
     assert "step:2" in done.stderr
