@@ -24,6 +24,7 @@ from pydantic import Field, TypeAdapter, ValidationError, field_validator
 
 from pipeline import seeding
 from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
+from pipeline.axes.language_copies import copies_test
 from pipeline.axes.language_lint import CLASSES, LENGTH, NAMED, REMEDY, Component, lint, normalise
 from pipeline.axes.report_data import BENCHMARK, CoveragePlots, Histogram, KeptPerturbation, ObservedEpisode, Strips
 from pipeline.errors import PipelineError
@@ -66,9 +67,12 @@ class LanguagePerturbation(TextPerturbation):
         return _distances(self.text, test, task)
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """Return the distance to the nearest test instruction, or 0 if ``text`` is a test instruction of any task."""
+        """Return the distance to the nearest test instruction.
+
+        It is 0 if ``text`` is a test instruction of any task, or copies a test instruction of ``task``.
+        """
         nearest = super().nearest(test, task)
-        if normalise(self.text) in _all_test_wordings(test):
+        if normalise(self.text) in _all_test_wordings(test) or copies_test(self.text, test, task):
             return nearest._replace(distance=0.0)
         return nearest
 

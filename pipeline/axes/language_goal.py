@@ -86,6 +86,8 @@ class Words(Frozen):
     shelves: Entries
     top: Entries
     drawer: Entries
+    common: Entries
+    function: Entries
 
 
 @cache

@@ -246,6 +246,45 @@ def test_the_bank_is_clear_of_the_test_set(task: Task, test: TestSet) -> None:
     assert close == []
 
 
+COMMON = "the a in on of it and to into onto inside please put place that is from"
+FUNCTION_WORDS = """
+the a an in on of it and to into onto inside is are be that which for with you could can would please i me my so then at
+by as
+"""
+
+
+def test_no_rewrite_shares_a_phrase_or_all_content_words_with_a_test_instruction(task: Task, test: TestSet) -> None:
+    """Six consecutive words, of which two are new: neither common nor in LIBERO's instruction of the task."""
+    known = {*COMMON.split(), *normalise(task.instruction).split()}
+    tested = [normalise(str(other.parameters["text"])).split() for other in test.on(task, "language")]
+    tested_phrases = {" ".join(words[k : k + 6]) for words in tested for k in range(len(words) - 5)}
+    tested_contents = {frozenset(words) - {*FUNCTION_WORDS.split()} for words in tested}
+    copied = []
+    for texts in load_bank()[task.suite][task.name].values():
+        for text in texts:
+            words = normalise(text).split()
+            shared = {" ".join(words[k : k + 6]) for k in range(len(words) - 5)} & tested_phrases
+            copied += [(text, phrase) for phrase in shared if len({*phrase.split()} - known) >= 2]
+            if frozenset(words) - {*FUNCTION_WORDS.split()} in tested_contents:
+                copied.append((text, "all content words"))
+    assert copied == []
+
+
+def test_a_rewrite_that_copies_a_test_instruction_is_left_out(tmp_path: Path, test: TestSet) -> None:
+    known, bank = find_task("libero_goal", "turn_on_the_stove"), tmp_path / "bank.yaml"
+    text = max((str(tested.parameters["text"]) for tested in test.on(known, "language")), key=len)
+    talk = "the neighbours have painted their garden fence in the brightest green that you can imagine; "
+    copy = LanguagePerturbation(component="distraction", level=1, text=talk + text)
+    assert min(copy.distances_on(test, known)) > copy.clearance
+    assert copy.nearest(test, known).distance == 0
+    reordered = copy.model_copy(update={"text": f"please {' '.join(reversed(text.split()))}"})
+    assert min(reordered.distances_on(test, known)) > reordered.clearance
+    assert reordered.nearest(test, known).distance == 0
+    bank.write_text(yaml.safe_dump({known.suite: {known.name: {"distraction": [copy.text]}}}))
+    assert copy.text in {card.text for card in deal(known, bank=bank)}
+    assert {*LanguageAxis(bank=bank).wordings(known, test)} == {*LanguageAxis().wordings(known, test)}
+
+
 def test_a_test_instruction_is_found_whatever_its_case_and_whatever_its_task(test: TestSet) -> None:
     """One that is nearly the same is found for tasks with the instruction of its own task only."""
     known, other = TASKS[0], TASKS[15]
