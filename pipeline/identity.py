@@ -33,7 +33,7 @@ Step = Literal["physics", "pixels", "encoding", "evaluation", "checks", "picture
 RECIPES: dict[Step, int] = {
     "physics": 8,
     "pixels": 7,
-    "encoding": 4,
+    "encoding": 5,
     "evaluation": 4,
     "checks": 14,
     "pictures": 11,

@@ -24,8 +24,10 @@ NAMES = {
     "akita_black_bowl": "black bowl",
     "black_book": "book",
     "chefmate_8_frypan": "frying pan",
+    "cookies": "cookie box",
     "desk_caddy": "caddy",
     "flat_stove": "stove",
+    "glazed_rim_porcelain_ramekin": "ramekin",
     "new_salad_dressing": "salad dressing",
     "porcelain_mug": "white mug",
     "red_coffee_mug": "red mug",
@@ -33,7 +35,8 @@ NAMES = {
     "white_yellow_mug": "yellow and white mug",
     "wooden_cabinet": "cabinet",
     "wooden_tray": "tray",
-    "wooden_two_layer_shelf": "shelf",
+    "wooden_two_layer_shelf": "cabinet shelf",
+    "yellow_book": "book",
 }
 """Kind to the other words that LIBERO's instructions use for it."""
 
@@ -42,6 +45,15 @@ SIDES = ("left", "right", "front", "back", "middle")
 
 INSIDE = {"cabinet": "drawer", "caddy": "compartment"}
 """Thing to the word for one of its parts."""
+
+SHELVES = ("wooden_two_layer_shelf",)
+"""Kinds of shelves."""
+
+SHELF_LEVELS = {"top": ("onto", "on"), "bottom": ("under", "under"), None: ("onto the top of", "on top of")}
+"""Part of a shelf to the words for the direction and the location; `None` is the top of the whole shelf.
+
+LIBERO's facts put things *in* the region above the board or in the region below it.
+"""
 
 NEXT_TO_M = 0.17
 """Distance of centres up to which things stand next to each other; in LIBERO it is 0.12 to 0.13 m."""
@@ -124,19 +136,48 @@ def read_goal(task: Task) -> TaskGoal:
 def called(bddl: Bddl, name: str) -> str:
     """Describe a thing or a part of it in plain words.
 
-    For example, wooden_cabinet_1_middle_region is the middle drawer of the cabinet.
+    For example, wooden_cabinet_1_middle_region is the middle drawer of the cabinet. If several things have one noun, an
+    object of the goal has the side in its region's name, or else the side in the instruction: the left book.
     """
-    return _words(*_Scene(bddl).part(name))
+    scene = _Scene(bddl)
+    kind, part = scene.part(name)
+    if part not in SIDES and name in bddl.targets and scene.has_namesakes(name):
+        sides = [side for side in SIDES if side in bddl.language.split()]
+        if len(sides) == 1:
+            part = sides[0]
+    return _words(kind, part)
+
+
+def called_at_start(bddl: Bddl, name: str) -> str:
+    """Describe an object as ``called`` does, with its place at the start if it shares its noun and has no side.
+
+    For example, akita_black_bowl_1 is the black bowl next to the ramekin.
+    """
+    scene, words = _Scene(bddl), called(bddl, name)
+    if not scene.has_namesakes(name) or {*words.split()} & {*SIDES}:
+        return words
+    aims = scene.unique_aims(fact for fact in bddl.start if len(fact) == 3 and fact[1] == name)
+    relations = {aim.relation for aim in aims}
+    places = [_words(aim.place, aim.part) for aim in aims if aim.place]
+    if places and relations <= {"on", "in", "next to", "between"}:
+        return f"{words} {aims[0].relation} {' and '.join(places)}"
+    return f"{words} at the table center" if any(aim.part == "center" for aim in aims) else words
 
 
 def where(bddl: Bddl, fact: Fact) -> tuple[str, str]:
-    """Describe the place of a fact of the goal, as a direction and as a location: to the plate, on the plate."""
+    """Describe the place of a fact of the goal, as a direction and as a location: to the plate, on the plate.
+
+    On the levels of a shelf, both say which: under the cabinet shelf.
+    """
     aim = next(_Scene(bddl).aims(*fact), None)
     if aim is None:
         return "to its place", "at its place"
     if aim.place is None or aim.relation in PARTS:
         side = f"to the {aim.relation} of {_words(aim.place)}" if aim.place else f"to the {aim.part}"
         return side, side
+    if aim.place in SHELVES and aim.part in SHELF_LEVELS:
+        direction, location = SHELF_LEVELS[aim.part]
+        return f"{direction} {_words(aim.place)}", f"{location} {_words(aim.place)}"
     place = _words(aim.place, aim.part)
     # LIBERO's bowls have no inside, so its facts put things on bowls; in words, things are in bowls.
     in_bowl = aim.place.endswith("bowl") and not aim.thing.endswith("bowl")
@@ -145,10 +186,15 @@ def where(bddl: Bddl, fact: Fact) -> tuple[str, str]:
 
 def _words(kind: str, part: str | None = None) -> str:
     """Describe a kind of thing, or a part of it, in plain words with an article."""
-    noun = NAMES.get(kind, kind.replace("_", " "))
+    noun = _noun(kind)
     if part and noun in INSIDE:
         return f"the {part} {INSIDE[noun]} of the {noun}"
     return f"the {part} {noun}" if part in SIDES else f"the {noun}"
+
+
+def _noun(kind: str) -> str:
+    """Return the word of LIBERO's instructions for a kind of thing."""
+    return NAMES.get(kind, kind.replace("_", " "))
 
 
 class _Scene:
@@ -162,6 +208,11 @@ class _Scene:
     def count(self, name: str) -> int:
         """Return the number of things that have the kind of a thing."""
         return list(self.kinds.values()).count(self.kinds.get(name, ""))
+
+    def has_namesakes(self, name: str) -> bool:
+        """Return whether other things of the scene have the noun of a thing."""
+        noun = _noun(self.kinds.get(name, name))
+        return any(_noun(kind) == noun for other, kind in self.kinds.items() if other != name)
 
     def part(self, name: str) -> tuple[str, str | None]:
         """Return the kind of a thing, and the word of ``PARTS`` that distinguishes it from others of its kind.

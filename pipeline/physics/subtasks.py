@@ -1,8 +1,12 @@
 """Subtasks of a trajectory in plain words, from contacts, joints and the gripper's commands.
 
 A lifted object of the goal has four subtasks: approach it, grasp it, move it to its place, place it there. An object
-that is moved without being lifted is pushed. A drawer, door or knob of the goal has two: approach it, then open, close
-or turn it. A subtask lasts until the next begins, so exactly one subtask is active at each step.
+that is moved without being lifted is pushed, unless it rises on another object in the hand. A drawer, door or knob of
+the goal has two: approach it, then open, close or turn it. A subtask lasts until the next begins, so exactly one
+subtask is active at each step.
+
+Until an object is lifted, the words for it include its place at the start if other things have the same noun: the black
+bowl next to the ramekin.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.libero.bddl import Bddl, Fact
 from pipeline.libero.carried import definition_of
-from pipeline.libero.task_goal import called, where
+from pipeline.libero.task_goal import called, called_at_start, where
 from pipeline.physics.reference import Mask, runs
 from pipeline.scenes.compiled import CompiledScene, contacts
 from pipeline.types import Floats, State, Subtask, Task, Trajectory
@@ -32,6 +36,9 @@ GAP = 10
 MOVED_M, LIFTED_M = 0.02, 0.01
 """Least displacements of a moved object, and of a gripped object that counts as lifted though it slides on its support.
 """
+
+CARRIED_M = 0.05
+"""Least rise of an object without a grip that lies on another object in the hand; a pushed object rises less."""
 
 TURNED, MOVING = 0.1, 0.005
 """Least shares of its range by which a drawer, door or knob moves in all, and in a step in which it counts as moving.
@@ -101,6 +108,8 @@ def subtasks_by_contacts(
             if first_step < len(trajectory.actions):
                 sequence.append(Subtask(first_step, text))
         begin = deed.left
+    if sequence and sequence[-1].text.startswith("approach "):
+        sequence.pop()  # The trajectory ends before the manipulation has its turn.
     return tuple(sequence)
 
 
@@ -130,7 +139,7 @@ class _Seen:
         resting = self._touch(body, ~body & ~self.robot)
         first = int(self.model.joint(f"{fact[1]}_joint0").qposadr[0])
         place = self.qpos[:, first : first + 3]
-        thing = called(problem, fact[1])
+        thing, thing_at_start = called(problem, fact[1]), called_at_start(problem, fact[1])
         to, at = where(problem, fact)
         for reached, left in _runs(self._touch(body, self.robot)):
             grips = np.flatnonzero(gripped[:left])
@@ -139,7 +148,9 @@ class _Seen:
             if _distances(place[reached : left + 1], place[reached]).max() < MOVED_M:
                 continue
             if not len(lifted):
-                yield _Deed(reached, left, thing, (Subtask(reached, f"push {thing} {to}"),))
+                # A thing that rises without a grip lies on another thing in the hand.
+                if np.max(place[reached : left + 1, 2]) - place[reached, 2] < CARRIED_M:
+                    yield _Deed(reached, left, thing_at_start, (Subtask(reached, f"push {thing_at_start} {to}"),))
                 continue
             grasp = np.flatnonzero(~self.closing[: lifted[0]]).max(initial=-1) + 1
             release = int(grips[-1]) + 1
@@ -150,8 +161,8 @@ class _Seen:
                     put_down.append(start)
             # ``map`` ends with the three texts, so the release is used only if the object was not put down before.
             steps = (int(grasp), int(lifted[0]), *put_down[-1:], release)
-            texts = (f"grasp {thing}", f"move {thing} {to}", f"place {thing} {at}")
-            yield _Deed(reached, left, thing, tuple(map(Subtask, steps, texts)))
+            texts = (f"grasp {thing_at_start}", f"move {thing} {to}", f"place {thing} {at}")
+            yield _Deed(reached, left, thing_at_start, tuple(map(Subtask, steps, texts)))
 
     def _with_part(self, problem: Bddl, fact: Fact) -> Iterator[_Deed]:
         """Yield the manipulations of the fact's drawer, door or knob: each turn of one of its joints."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import ReplayConfig
 from pipeline.libero import bddl
-from pipeline.libero.task_goal import called, where
+from pipeline.libero.task_goal import called, called_at_start, where
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
@@ -191,3 +191,60 @@ def test_each_task_has_words_for_its_goal() -> None:
             assert len({*words}) == len(words), task.name
             words += [word for fact in known.goal if len(fact) == 3 for word in where(known, fact)]
             assert all(word.replace(" ", "").isalpha() and "place" not in word for word in words), task.name
+
+
+def words_of(suite: str, name: str) -> list[tuple[str, str, str, str]]:
+    """Words of each goal: a thing, the thing at the start, the direction and the location of its place."""
+    known = bddl.read(find_task(suite, name).bddl_file)
+    return [(called(known, fact[1]), called_at_start(known, fact[1]), *where(known, fact)) for fact in known.goal]
+
+
+def test_the_levels_of_a_shelf_have_their_own_words() -> None:
+    levels = {}
+    for level in ("on_the_cabinet_shelf", "under_the_cabinet_shelf", "on_top_of_the_cabinet"):
+        [(pan, _, *levels[level])] = words_of("libero_90", f"KITCHEN_SCENE9_put_the_frying_pan_{level}")
+        assert pan == "the frying pan"
+    assert levels == {
+        "on_the_cabinet_shelf": ["onto the cabinet shelf", "on the cabinet shelf"],
+        "under_the_cabinet_shelf": ["under the cabinet shelf", "under the cabinet shelf"],
+        "on_top_of_the_cabinet": ["onto the top of the cabinet shelf", "on top of the cabinet shelf"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "book"),
+    [
+        ("in_the_middle_and_place_it_on_the_cabinet_shelf", "the middle book"),
+        ("on_the_left_and_place_it_on_top_of_the_shelf", "the left book"),
+        ("on_the_right_and_place_it_under_the_cabinet_shelf", "the right book"),
+    ],
+)
+def test_books_are_told_apart_by_their_sides(name: str, book: str) -> None:
+    [(thing, at_start, _, _)] = words_of("libero_90", f"STUDY_SCENE4_pick_up_the_book_{name}")
+    assert thing == at_start == book
+
+
+def test_a_bowl_among_bowls_has_its_place_at_the_start() -> None:
+    """Up to the table's center and the cabinet's material, the places are those of LIBERO's instructions."""
+    for task in tasks("libero_spatial"):
+        place = task.instruction.removeprefix("pick up the ").removesuffix(" and place it on the plate")
+        place = place.replace("from table", "at the table").replace("wooden ", "")
+        assert words_of(task.suite, task.name) == [("the black bowl", f"the {place}", "to the plate", "on the plate")]
+    for task in tasks("libero_goal"):
+        known = bddl.read(task.bddl_file)
+        assert [called_at_start(known, name) for name in known.targets] == [
+            called(known, name) for name in known.targets
+        ]
+
+
+def test_a_stack_in_the_hand_is_not_pushed_and_nothing_is_approached_at_the_end() -> None:
+    task = find_task("libero_90", "LIVING_ROOM_SCENE4_stack_the_right_bowl_on_the_left_bowl_and_place_them_in_the_tray")
+    environment = Environment(task)
+    trajectory = replay(environment, starter_demo(task), "short", ReplayConfig())
+    environment.close()
+    assert [text for _, text in subtasks(trajectory, task)] == [
+        "approach the right black bowl",
+        "grasp the right black bowl",
+        "move the right black bowl to the left black bowl",
+        "place the right black bowl on the left black bowl",
+    ]
