@@ -96,6 +96,7 @@ def test_no_rewrite_is_stored_twice_in_a_suite(suite: str) -> None:
         ("go, " * 19 + "on", "39 words and marks"),
         ("go understandingly " * 9 + "on", "173 characters"),
         ("put the bowl, on the plate", "original"),
+        ("with the plate opened, put the bowl on it", "presents a requested step as done"),
     ],
 )
 def test_lint_names_the_fault(text: str, reason: str) -> None:
