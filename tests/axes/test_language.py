@@ -284,8 +284,10 @@ def test_a_rewrite_that_copies_a_test_instruction_is_left_out(tmp_path: Path, te
     assert min(reordered.distances_on(test, known)) > reordered.clearance
     assert reordered.nearest(test, known).distance == 0
     bank.write_text(yaml.safe_dump({known.suite: {known.name: {"distraction": [copy.text]}}}))
-    assert copy.text in {card.text for card in deal(known, bank=bank)}
-    assert {*LanguageAxis(bank=bank).wordings(known, test)} == {*LanguageAxis().wordings(known, test)}
+    assert copy.text in {card.text for card in list_rewrites(known, bank=bank)}
+    assert {*LanguageAxis(bank=bank).list_clear_rewrites(known, test)} == {
+        *LanguageAxis().list_clear_rewrites(known, test)
+    }
 
 
 def test_a_test_instruction_is_found_whatever_its_case_and_whatever_its_task(test: TestSet) -> None:
