@@ -31,11 +31,18 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task, Trajectory, Verdict
 
-ACTIONS = st.lists(st.tuples(st.sampled_from([0.0, 5e-5, 0.3]), st.sampled_from([-1.0, 1.0])), min_size=1, max_size=30)
+ENTRIES = st.sampled_from([0.0, 0.0, 5e-5, 9e-5, 1.1e-4, 0.3])
+"""Movement in one of six directions, around the limit of 1e-4; two directions of 9e-5 together are above it."""
+
+ACTIONS = st.lists(
+    st.tuples(st.tuples(*[ENTRIES] * 6), st.sampled_from([-1.0, 1.0])),
+    min_size=1,
+    max_size=30,
+)
 
 
-def actions_of(drawn: list[tuple[float, float]]) -> Floats:
-    return np.array([[delta, 0, 0, 0, 0, 0, gripper] for delta, gripper in drawn])
+def actions_of(sampled: list[tuple[tuple[float, ...], float]]) -> Floats:
+    return np.array([[*movement, gripper] for movement, gripper in sampled])
 
 
 def openvla_is_noop(action: Floats, previous: Floats | None) -> bool:
@@ -46,8 +53,8 @@ def openvla_is_noop(action: Floats, previous: Floats | None) -> bool:
 
 
 @given(ACTIONS)
-def test_drop_is_openvla_rule(drawn: list[tuple[float, float]]) -> None:
-    actions = actions_of(drawn)
+def test_drop_is_openvla_rule(sampled: list[tuple[tuple[float, ...], float]]) -> None:
+    actions = actions_of(sampled)
     expected, previous = [], None
     for action in actions:
         expected.append(not openvla_is_noop(action, previous))
@@ -57,8 +64,8 @@ def test_drop_is_openvla_rule(drawn: list[tuple[float, float]]) -> None:
 
 
 @given(ACTIONS)
-def test_policies_nest(drawn: list[tuple[float, float]]) -> None:
-    actions = actions_of(drawn)
+def test_policies_nest(sampled: list[tuple[tuple[float, ...], float]]) -> None:
+    actions = actions_of(sampled)
     drop, trim, keep = (kept_actions(actions, policy) for policy in ("drop", "trim_ends", "keep"))
     assert (drop <= trim).all()
     assert (trim <= keep).all()

@@ -170,6 +170,12 @@ def test_what_drops_little_or_nothing_is_not_asked_for(clone: Path) -> None:
     assert "no longer" not in run_stages(clone, fields, ["inputs", "replay"])
 
 
+@pytest.mark.parametrize(("share", "asks"), [(0.0, False), (0.09, False), (0.1, False), (0.11, True), (0.2, True)])
+def test_a_person_is_asked_about_more_than_a_tenth(share: float, asks: bool) -> None:
+    assert dropped.Dropped(trajectories=1, share=share).asks == asks
+    assert dropped.Dropped(episodes=1, episode_share=share).asks == asks
+
+
 def test_the_hours_are_those_of_the_frames_that_would_be_rendered_again(clone: Path) -> None:
     """All frames of the run under another JPEG quality, at the measured cost of a frame on the reference machine."""
     config = load(Path("configs/tiny.yaml"))

@@ -40,6 +40,7 @@ from pipeline.run.export import episodes_of
 from pipeline.run.layout import DATASETS, FINISHED, STATISTICS
 from pipeline.run.run import Run
 from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.types import Task, Trajectory
 
 
 @pytest.fixture(scope="session")
@@ -151,7 +152,7 @@ def test_conventions(finished: Path, rows: list[dict[str, Any]]) -> None:
     episode = loader(finished)(twin["episode_id"])
     trajectory = TrajectoryStore(finished / "trajectories").load(twin["trajectory_id"])
     assert np.array_equal(episode.action, trajectory.actions.astype(np.float32))
-    assert set(np.unique(episode.action[:, 6])) <= {SCHEMA.action.gripper.open, SCHEMA.action.gripper.close}
+    assert set(np.unique(episode.action[:, 6])) <= {-1, 1}
     assert np.allclose(np.diff(trajectory.states[:, 0]), 1 / SCHEMA.fps_hz)
     # LIBERO's raw frames have their first row at the bottom: turned by 180 degrees, the frame is upright, so the
     # table is below and the wall behind the robot above; and it is a mirror image, as OpenVLA trains on it.
@@ -161,6 +162,24 @@ def test_conventions(finished: Path, rows: list[dict[str, Any]]) -> None:
     renderer.close()
     shown = decode(episode.frames["image"][0]).astype(float)
     assert np.abs(shown - np.rot90(raw, 2)).mean() < 3 < np.abs(shown - raw).mean()
+
+
+def test_the_fingers_follow_the_sign_of_the_gripper(whole: dict[Task, Trajectory]) -> None:
+    """Four commands of 1 bring the open fingers together, and four of -1 part the closed fingers."""
+    assert (SCHEMA.action.gripper.open, SCHEMA.action.gripper.close) == (-1, 1)
+    closed, opened = 0, 0
+    for trajectory in whole.values():
+        # A state begins with the time and seven joints of the arm; the two fingers follow.
+        command, width_m = trajectory.actions[:, 6], trajectory.states[:, 8] - trajectory.states[:, 9]
+        for t in range(len(command) - 4):
+            if (command[t : t + 4] == 1).all() and width_m[t] > 0.06:
+                assert width_m[t + 4] < width_m[t]
+                closed += 1
+            if (command[t : t + 4] == -1).all() and width_m[t] < 0.03:
+                assert width_m[t + 4] > width_m[t]
+                opened += 1
+    assert closed > 0
+    assert opened > 0
 
 
 def test_twins_share_what_does_not_differ(finished: Path, rows: list[dict[str, Any]]) -> None:

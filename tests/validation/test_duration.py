@@ -60,6 +60,11 @@ def test_room_is_asked_for_reserves_too() -> None:
     assert trajectories_mb(100, 1.0) == pytest.approx(trajectories_mb(200, 0.0))
 
 
+def test_the_estimate_of_the_default_run_is_near_its_measured_time() -> None:
+    measured_s = 5.9 * 60  # On two cores, docs/cost.md.
+    assert 0.6 < sum(needed_s(STARTER, REFERENCE).values()) / 2 / measured_s < 1.5
+
+
 def test_it_follows_the_machine() -> None:
     here = needed_s(STARTER, REFERENCE)
     config = STARTER.model_copy(update={"compute": ComputeConfig(cluster="local", workers=8)})
