@@ -29,7 +29,7 @@ from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import ALL_VIEWS, SCHEMA, SIZE_PX
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_code
-from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame, Trajectory
 
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--view", choices=ALL_VIEWS, action="append", help="a view to render; by default the usual two")
     parser.add_argument("--size-px", type=int, default=SIZE_PX, help="height and width of the frames")
     arguments = parser.parse_args()
-    config, drawn = load(Path("configs/starter.yaml")), Clock("mjr_render", "mjr_readPixels")
+    config, rendering = load(Path("configs/starter.yaml")), Clock("mjr_render", "mjr_readPixels")
     figures: dict[str, dict[str, dict[str, float]]] = {}
     for arena, task in ARENAS.items():
         with TemporaryDirectory() as folder:
@@ -77,7 +77,7 @@ def main() -> None:
             for view in arguments.view or SCHEMA.views:
                 renderers = opened_both_ways(trajectory, arguments.size_px)
                 figures[arena][view + shadows] = compared(
-                    trajectory, renderers, ALL_VIEWS[view].camera, frames, bool(shadows), drawn
+                    trajectory, renderers, ALL_VIEWS[view].camera, frames, bool(shadows), rendering
                 )
         print(arena, figures[arena], flush=True)
     print(json.dumps({"frames": arguments.frames, "size_px": arguments.size_px, "arenas": figures}))
@@ -85,31 +85,31 @@ def main() -> None:
 
 def opened_both_ways(trajectory: Trajectory, size_px: int) -> dict[str, Renderer]:
     ours = Renderer(trajectory.model_xml, size_px=size_px)
-    return {"plain": Renderer(ours.model, PlainDrawing(ours.model, size_px)), "ours": ours}
+    return {"plain": Renderer(ours.model, PlainRenderer(ours.model, size_px)), "ours": ours}
 
 
 def compared(
-    trajectory: Trajectory, renderers: dict[str, Renderer], camera: str, frames: int, shadows: bool, drawn: Clock
+    trajectory: Trajectory, renderers: dict[str, Renderer], camera: str, frames: int, shadows: bool, rendering: Clock
 ) -> dict[str, float]:
     renderers["ours"].model.light_castshadow[:] |= shadows
     steps = range(min(frames, len(trajectory.actions)))
     with closing(renderers["ours"]), closing(renderers["plain"]):
-        spent_s, beside_s = dict.fromkeys(renderers, 0.0), dict.fromkeys(renderers, 0.0)
+        spent_s, other_s = dict.fromkeys(renderers, 0.0), dict.fromkeys(renderers, 0.0)
         same = 0
         for step in steps:
             pictures: list[Frame] = []
             for name, renderer in renderers.items():
-                start, drawn_before_s = time.process_time(), drawn.spent_s
+                start, rendering_before_s = time.process_time(), rendering.spent_s
                 renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                 pictures.append(renderer.frame(camera))
                 encode(to_policy(pictures[-1]), RenderConfig().jpeg_quality)
                 took_s = time.process_time() - start
                 spent_s[name] += took_s
-                beside_s[name] += took_s - (drawn.spent_s - drawn_before_s)
+                other_s[name] += took_s - (rendering.spent_s - rendering_before_s)
             same += np.array_equal(pictures[0], pictures[1])
     return {
         **{f"{name}_ms": round(1000 * seconds / len(steps), 1) for name, seconds in spent_s.items()},
-        **{f"{name}_beside_drawing_ms": round(1000 * seconds / len(steps), 2) for name, seconds in beside_s.items()},
+        **{f"{name}_beside_drawing_ms": round(1000 * seconds / len(steps), 2) for name, seconds in other_s.items()},
         "share": round(spent_s["ours"] / spent_s["plain"], 2),
         "frames": len(steps),
         "same_frames": same,

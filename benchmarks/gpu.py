@@ -46,12 +46,12 @@ from pipeline.compute.workers import VARIABLES
 from pipeline.config import RenderConfig
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.machine_code import ensure_fixed_machine_code
-from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import calls
-from pipeline.rendering.savings import drawing_of, why_plain
-from pipeline.rendering.software.drawing import SoftwareDrawing
-from pipeline.rendering.software.in_flight import InFlightDrawing
-from pipeline.rendering.software.layers import LayersDrawing
+from pipeline.rendering.plain_renderer import PlainRenderer
+from pipeline.rendering.savings import create_model_renderer, why_plain
+from pipeline.rendering.software.in_flight import InFlightRenderer
+from pipeline.rendering.software.layers import LayeredRenderer
+from pipeline.rendering.software.software_renderer import SoftwareRenderer
 from pipeline.types import Frame, State
 
 CAMERAS = ("agentview", "robot0_eye_in_hand")
@@ -67,11 +67,11 @@ Frames = np.ndarray[Any, np.dtype[np.uint8]]
 _FILE = re.compile(r'\sfile\w*="')
 """Beginning of an attribute that names a file."""
 
-KINDS: dict[str, type[PlainDrawing]] = {
-    "plain": PlainDrawing,
-    "plain, 2 in flight": InFlightDrawing,
-    "layers": LayersDrawing,
-    "savings": SoftwareDrawing,
+KINDS: dict[str, type[PlainRenderer]] = {
+    "plain": PlainRenderer,
+    "plain, 2 in flight": InFlightRenderer,
+    "layers": LayeredRenderer,
+    "savings": SoftwareRenderer,
 }
 
 
@@ -245,12 +245,12 @@ def compared(workers: Sequence[Connection], names: Sequence[str], states: int) -
 
 
 def opened(workers: Sequence[Connection], name: str) -> str | None:
-    """Create a ``PlainDrawing`` of a kind in all workers, and return an error if there is one."""
+    """Create a ``PlainRenderer`` of a kind in all workers, and return an error if there is one."""
     return fault_of(asked(workers, [("open", name)] * len(workers)))
 
 
 def rendered(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
-    """Measure some workers with an open ``PlainDrawing`` at the same time."""
+    """Measure some workers with an open ``PlainRenderer`` at the same time."""
     with gpu_load() as loads:
         done = asked(workers, [("render", seconds)] * len(workers))
     fault = fault_of(done)
@@ -266,7 +266,7 @@ def rendered(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
 
 
 def profiled(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
-    """Return the milliseconds of a frame by part of the work, the mean of workers with an open ``PlainDrawing``."""
+    """Return the milliseconds of a frame by part of the work, the mean of workers with an open ``PlainRenderer``."""
     done = asked(workers, [("profile", seconds)] * len(workers))
     fault = fault_of(done)
     if fault:
@@ -298,34 +298,34 @@ def serve(connection: Connection, setup: gl.WorkerSetup, number: int, folder: Pa
     setup(number)
     scene = Scene.load(folder, next(iter(TASKS)))
     connection.send(None)
-    drawing: PlainDrawing | None = None
+    renderer: PlainRenderer | None = None
     for question in iter(connection.recv, None):
         subject, *arguments = question
-        if drawing and subject not in ("render", "profile"):
-            drawing.close()
-            drawing = None
+        if renderer and subject not in ("render", "profile"):
+            renderer.close()
+            renderer = None
         answer: Any = None
         try:
             if subject == "choose":
-                drawing = drawing_of(scene.model)
-                answer = {"drawing": type(drawing).__name__, "why plain": why_plain()}
+                renderer = create_model_renderer(scene.model)
+                answer = {"drawing": type(renderer).__name__, "why plain": why_plain()}
             elif subject == "open":
-                drawing = KINDS[arguments[0]](scene.model)
-                render(scene, drawing, 0.3)
+                renderer = KINDS[arguments[0]](scene.model)
+                render(scene, renderer, 0.3)
             elif subject == "compare":
                 answer = asdict(compare(folder, *arguments))
-            elif drawing and subject == "render":
-                answer = render(scene, drawing, *arguments)
-            elif drawing:
-                answer = profile(scene, drawing, *arguments)
+            elif renderer and subject == "render":
+                answer = render(scene, renderer, *arguments)
+            elif renderer:
+                answer = profile(scene, renderer, *arguments)
         except Exception as error:  # drivers fail in many ways, and each is an answer here
             answer = f"{type(error).__name__}: {error}"
         connection.send(answer)
-    if drawing:
-        drawing.close()
+    if renderer:
+        renderer.close()
 
 
-def render(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
+def render(scene: Scene, renderer: PlainRenderer, seconds: float) -> Work:
     """Render and encode the scene's states in turn for some seconds, with both cameras."""
     work, data = Work(parts_s=dict.fromkeys(("restore", "start", "wait", "encode"), 0.0)), mujoco.MjData(scene.model)
     waiting: deque[Callable[[], Frame]] = deque()
@@ -347,8 +347,8 @@ def render(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
         timed("restore", scene.restore, data, step)
         step = (step + 1) % (len(scene.states) - 1)
         for camera in CAMERAS:
-            waiting.append(timed("start", drawing.start_frame, data, camera))
-            while len(waiting) > drawing.steps_ahead * len(CAMERAS):
+            waiting.append(timed("start", renderer.start_frame, data, camera))
+            while len(waiting) > renderer.steps_ahead * len(CAMERAS):
                 finish()
     while waiting:
         finish()
@@ -357,7 +357,7 @@ def render(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
     return work
 
 
-def profile(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
+def profile(scene: Scene, renderer: PlainRenderer, seconds: float) -> Work:
     """Render like ``render``, and measure the calls of MuJoCo and the GPU's time for its pictures too."""
     spent_s: dict[str, float] = {}
     queries: list[int] = []
@@ -384,7 +384,7 @@ def profile(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
     for name, call in (calls_of_mujoco | {"mjr_render": on_gpu}).items():
         setattr(mujoco, name, call)
     try:
-        work = render(scene, drawing, seconds)
+        work = render(scene, renderer, seconds)
     finally:
         for name, function in functions.items():
             setattr(mujoco, name, function)
@@ -398,7 +398,7 @@ def profile(scene: Scene, drawing: PlainDrawing, seconds: float) -> Work:
 def compare(folder: Path, name: str, states: int) -> Pixels:
     """Compare the frames of a kind of rendering with plain frames, in all scenes, with and without shadows."""
     frames = other = most_levels = 0
-    plain_frames = list(frames_of_scenes(folder, PlainDrawing, states))
+    plain_frames = list(frames_of_scenes(folder, PlainRenderer, states))
     for plain, ours in zip(plain_frames, frames_of_scenes(folder, KINDS[name], states), strict=True):
         levels = np.abs(ours.astype(int) - plain).reshape(len(plain), -1).max(axis=1)
         frames, other = frames + len(levels), other + int(np.count_nonzero(levels))
@@ -406,26 +406,26 @@ def compare(folder: Path, name: str, states: int) -> Pixels:
     return Pixels(frames, other, most_levels)
 
 
-def frames_of_scenes(folder: Path, kind: type[PlainDrawing], states: int) -> Iterator[Frames]:
+def frames_of_scenes(folder: Path, kind: type[PlainRenderer], states: int) -> Iterator[Frames]:
     """Yield the frames of each scene, without and with shadows; following scenes share a context if possible."""
     with ExitStack() as opened:
-        drawing: PlainDrawing | None = None
+        renderer: PlainRenderer | None = None
         for task, shadows in product(TASKS, (False, True)):
             scene = Scene.load(folder, task)
             scene.model.light_castshadow[:] |= shadows
-            if drawing is None or not drawing.adopt(scene.model):
+            if renderer is None or not renderer.adopt(scene.model):
                 opened.close()
-                drawing = opened.enter_context(closing(kind(scene.model)))
-            yield frames_of(scene, drawing, states)
+                renderer = opened.enter_context(closing(kind(scene.model)))
+            yield frames_of(scene, renderer, states)
 
 
-def frames_of(scene: Scene, drawing: PlainDrawing, states: int) -> Frames:
+def frames_of(scene: Scene, renderer: PlainRenderer, states: int) -> Frames:
     """Render some states, from the first to the last, with both cameras, (N, H, W, 3)."""
     data = mujoco.MjData(scene.model)
     waiting: list[Callable[[], Frame]] = []
     for step in np.linspace(0, len(scene.states) - 1, states).round().astype(int).tolist():
         scene.restore(data, step)
-        waiting += [drawing.start_frame(data, camera) for camera in CAMERAS]
+        waiting += [renderer.start_frame(data, camera) for camera in CAMERAS]
     return np.stack([wait() for wait in waiting])
 
 

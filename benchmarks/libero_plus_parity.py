@@ -47,7 +47,7 @@ GREY_LEVELS = {"motion": 1}
 MEASURED = ("state_error", "agentview_grey_levels", "agentview_differing", "wrist_grey_levels", "wrist_differing")
 
 
-class BenchmarkDraws:
+class BenchmarkGenerator:
     """Generator that gives this project's functions one frame's samples in the order of the benchmark's functions."""
 
     def __init__(self, seed: int):
@@ -82,8 +82,8 @@ class BenchmarkNoise(NoisePerturbation):
     """Corruption of a noise task, with the samples of the benchmark's side of the comparison."""
 
     def apply(self, frame: Frame, frame_index: int) -> Frame:
-        draws: Any = BenchmarkDraws(NOISE_SEED + frame_index)
-        return self.effect.apply(frame, draws)
+        generator: Any = BenchmarkGenerator(NOISE_SEED + frame_index)
+        return self.effect.apply(frame, generator)
 
 
 def main() -> None:
@@ -157,7 +157,7 @@ def gripped(actions: Floats) -> Floats:
     return np.column_stack([actions[:, :6], np.where(actions[:, 6] < 0, -1.0, 1.0)])
 
 
-def with_benchmark_draws(change: Perturbation) -> Perturbation:
+def with_benchmark_noise(change: Perturbation) -> Perturbation:
     """Replace noise by noise with the benchmark's samples; return any other perturbation unchanged."""
     if not isinstance(change, NoisePerturbation):
         return change
@@ -169,7 +169,7 @@ def compare(environment: EpisodeEnvironment, task: EvaluationTask, folder: Path)
     with np.load(folder / f"{task.suite}-{task.name}.npz") as theirs:
         states, views = theirs["states"], {view: theirs[view] for view in ("agentview", "wrist")}
     environment.reset(task)
-    perturbations = tuple(map(with_benchmark_draws, environment.perturbations))
+    perturbations = tuple(map(with_benchmark_noise, environment.perturbations))
     environment._picture.show(environment.simulator.model, perturbations)
     state_error, grey, differing = 0.0, dict.fromkeys(views, 0), dict.fromkeys(views, 0)
     for step, state in enumerate(states):

@@ -58,13 +58,13 @@ def main() -> None:
             render_plan(rows, config, TrajectoryStore(trajectories), FrameStore(root / name, config.render), run)
             return time.perf_counter() - start
 
-        drawn_s: list[tuple[float, float]] = []
+        frames_s: list[tuple[float, float]] = []
         start_frame = Renderer.start_frame
 
         def timed(renderer: Renderer, camera: str) -> Callable[[], Frame]:
             start_s, start_cpu_s = time.perf_counter(), time.process_time()
             wait = start_frame(renderer, camera)
-            drawn_s.append((time.perf_counter() - start_s, time.process_time() - start_cpu_s))
+            frames_s.append((time.perf_counter() - start_s, time.process_time() - start_cpu_s))
             return wait
 
         with patch.object(Renderer, "start_frame", timed):
@@ -76,13 +76,13 @@ def main() -> None:
             with patch("dask.system.CPU_COUNT", workers), runner(config_of_workers, root, renders=True) as run:
                 run(_warm, range(4 * workers), "workers")
                 by_workers[workers] = rendered(run, f"by_{workers}")
-    bare_s, bare_cpu_s = map(sum, zip(*drawn_s, strict=True))
+    bare_s, bare_cpu_s = map(sum, zip(*frames_s, strict=True))
     several_s = by_workers[arguments.workers]
     print(
         json.dumps(
             {
                 "config": str(arguments.config),
-                "frames_drawn": len(drawn_s),
+                "frames_drawn": len(frames_s),
                 "bare_s": round(bare_s, 1),
                 "bare_cpu_s": round(bare_cpu_s, 1),
                 "one_process_s": round(here_s, 1),

@@ -66,8 +66,8 @@ def main() -> None:
         axis, options = AXES[measured]
         episodes = {axis: len(entries) * arguments.draws}
         axes = {axis: {"levels": [level], **options}}
-        drawn = PlanConfig.model_validate({"seed": 1, "axes": axes, "episodes": episodes, "reserve": 0.0})
-        rows |= {row.episode_id: row for row in plan.make(entries, drawn, REPLAY, test)}
+        plan_config = PlanConfig.model_validate({"seed": 1, "axes": axes, "episodes": episodes, "reserve": 0.0})
+        rows |= {row.episode_id: row for row in plan.make(entries, plan_config, REPLAY, test)}
     with (
         tempfile.TemporaryDirectory() as temporary,
         runner(ComputeConfig(workers=arguments.workers), Path("data")) as run,

@@ -260,7 +260,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Camera matrices of a view and its maps besides colours; ``schemas/episode.json`` defines the conventions.
+    """Camera matrices of a view and its maps other than colours; ``schemas/episode.json`` defines the conventions.
 
     Attributes:
         intrinsics: (3, 3) float32, camera to pixels of the stored frame.

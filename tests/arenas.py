@@ -10,9 +10,9 @@ from conftest import MILK, STOVE, starter_demo
 
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
-from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.software_renderer import SoftwareRenderer
 from pipeline.types import Floats, Frame
 
 VIEWS = ("agentview", "robot0_eye_in_hand")
@@ -39,12 +39,12 @@ def scene(arena: str) -> tuple[str, Floats]:
 
 
 @contextmanager
-def both_ways(opened: Renderer) -> Iterator[tuple[SoftwareDrawing, PlainDrawing]]:
-    """Yield a renderer's drawing with savings, and MuJoCo's own drawing of its model in a separate context."""
+def both_ways(opened: Renderer) -> Iterator[tuple[SoftwareRenderer, PlainRenderer]]:
+    """Yield a renderer's model renderer with savings, and a plain one of its model in a separate context."""
     with closing(opened):
-        assert isinstance(opened.drawing, SoftwareDrawing)
-        with closing(PlainDrawing(opened.model)) as plain:
-            yield opened.drawing, plain
+        assert isinstance(opened.model_renderer, SoftwareRenderer)
+        with closing(PlainRenderer(opened.model)) as plain:
+            yield opened.model_renderer, plain
 
 
 def renderer(arena: str) -> Renderer:

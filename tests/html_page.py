@@ -45,7 +45,7 @@ class Page(HTMLParser):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def needs_nothing_beside_itself(html: str) -> None:
+def needs_no_other_file(html: str) -> None:
     """Assert that all tags are closed, and that the page has no scripts, external resources or links."""
     page = Page(html)
     assert not page.unclosed

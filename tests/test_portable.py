@@ -167,7 +167,7 @@ def test_an_object_in_a_scene_is_found_where_the_project_lies_now(
     assert portable(located(stored, "there")) == stored
 
 
-def test_an_object_that_is_gone_or_another_is_refused(wedge: ObjectModel) -> None:
+def test_an_object_that_is_gone_or_has_changed_is_rejected(wedge: ObjectModel) -> None:
     stored = portable(scene_with(wedge))
     (hull,) = (object_sources.FOLDER.resolve() / "own").rglob("hull.obj")
     content = hull.read_bytes()

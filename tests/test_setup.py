@@ -193,7 +193,7 @@ def test_checks_style_types_and_behaviour(tree: Tree, verb: str, selection: str)
     assert done.returncode == 0, done.stderr
     *_, check, form, one, other = tree.calls()
     assert (check, form) == ("ruff check", "ruff format --check")
-    # Beside each other, in any order.
+    # Next to each other, in any order.
     assert {one, other} == {"mypy", f"pytest -n 2 --dist loadfile --no-loadscope-reorder {selection}".rstrip()}
 
 
@@ -249,7 +249,7 @@ def test_no_python_and_none_to_fetch(tree: Tree) -> None:
     assert "apt-get install -y python3 python3-venv" in done.stderr
 
 
-def test_an_unknown_verb_is_refused_before_any_work(tree: Tree) -> None:
+def test_an_unknown_verb_is_rejected_before_any_work(tree: Tree) -> None:
     done = tree.setup("install")
     assert done.returncode != 0
     assert "unknown verb 'install'" in done.stderr

@@ -29,7 +29,7 @@ def test_merge_keys_at_any_depth_are_read_as_yaml_says(loader: Any) -> None:
 
 @pytest.mark.parametrize("loader", LOADERS)
 @pytest.mark.parametrize("text", ["[{a: {x: 1, y: 2, x: 1}}]", "a: &k {x: 1, x: 2}\nb: {<<: *k}", "{<<: {x: 1, x: 2}}"])
-def test_a_key_given_twice_is_refused_wherever_it_is(loader: Any, text: str) -> None:
+def test_a_key_given_twice_is_rejected_wherever_it_is(loader: Any, text: str) -> None:
     with pytest.raises(yaml.YAMLError, match="the key 'x' is repeated"):
         yaml.load(text, loader)
 

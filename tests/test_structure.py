@@ -13,7 +13,7 @@ from pipeline.axes import AXES
 
 CONTRIBUTING = REPOSITORY / "CONTRIBUTING.md"
 FLOOR = re.compile(r"^\w+( > \w+)+", re.MULTILINE)
-"""Start of a line in the drawing of the rooms: names, from top to bottom."""
+"""Start of a line in the diagram of the rooms: names, from top to bottom."""
 
 
 def floors() -> list[str]:
@@ -64,7 +64,7 @@ def test_no_circle_of_modules(graph: dict[str, set[str]]) -> None:
 def test_imports_run_downwards(graph: dict[str, set[str]]) -> None:
     rooms = {room(module) for module in graph} - {"pipeline"}
     order = floors()
-    assert sorted(rooms) == sorted(order), f"the drawing in {CONTRIBUTING.name} has each room once"
+    assert sorted(rooms) == sorted(order), f"the diagram in {CONTRIBUTING.name} has each room once"
     upwards = [
         f"{module} imports {other}"
         for module, imported in graph.items()

@@ -16,13 +16,13 @@ LIBRARIES = r"(EGL|GL|OpenGL|OSMesa)\\b"
 SITE = f"""
 import re, sys
 
-def refuse(event, arguments):
+def reject(event, arguments):
     if event == "ctypes.dlopen" and re.search("{LIBRARIES}", str(arguments[0])):
         raise OSError(f"{{arguments[0]}}: cannot open shared object file: No such file or directory")
 
-sys.addaudithook(refuse)
+sys.addaudithook(reject)
 """
-REFUSED = """
+NONE_LOADS = """
 import ctypes, ctypes.util
 for name in ("EGL", "GL", "OSMesa"):
     try:
@@ -31,7 +31,7 @@ for name in ("EGL", "GL", "OSMesa"):
         continue
     raise SystemExit(f"lib{name} can be loaded here")
 """
-# The stage, and then what the process has loaded. OpenCV's windows are linked with libGL itself, which draws nothing
+# The stage, and then what the process has loaded. OpenCV's windows are linked with libGL itself, which renders nothing
 # without one of these.
 STAGE = """
 import re, runpy, sys
@@ -52,7 +52,9 @@ def machine(tmp_path: Path) -> dict[str, str]:
     asked = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
     environment = {name: value for name, value in os.environ.items() if name not in asked}
     environment["PYTHONPATH"] = os.pathsep.join((str(folder), str(REPOSITORY)))
-    done = subprocess.run([sys.executable, "-c", REFUSED], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", NONE_LOADS], env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return environment
 

@@ -41,7 +41,7 @@ RECIPE = TrainingRecipe(
 )
 
 
-def draw(dataset: LeRobotDataset, index: int, picture: Path) -> None:
+def render(dataset: LeRobotDataset, index: int, picture: Path) -> None:
     """Save a frame, four times as large, with the points of its trace from white to red."""
     item = dataset[index]
     trace = emitted_at(0.0, persistent=[], events=item["language_events"], style="trace", camera=CAMERA)
@@ -84,7 +84,7 @@ def main(root: Path, *pictures: Path) -> None:
         print(f"episode {episode}: {count} frames: {text}")
     print(f"{traces} traces with {points} points; {len(motions)} different motions, such as {motions.most_common(3)}")
     for picture in pictures:
-        draw(dataset, 0, picture)
+        render(dataset, 0, picture)
 
 
 if __name__ == "__main__":

@@ -29,8 +29,8 @@ import yaml
 from experiment import Experiment, read
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation import own_draws
-from pipeline.evaluation.results import REFUSED, EpisodeFiles, EpisodeResult
+from pipeline.evaluation import held_out
+from pipeline.evaluation.results import REJECTED, EpisodeFiles, EpisodeResult
 from pipeline.evaluation.task_list import write_tasks
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import checksum, read_json, write
@@ -112,7 +112,7 @@ class Work:
         from results import PolicyResults
         from server_process import running
 
-        held_out = self._held_out(kept) if self.experiment.evaluation.held_out else None
+        held_out_tests = self._held_out(kept) if self.experiment.evaluation.held_out else None
         self.train(arm, seed)
         policy = self.policy(arm, seed)
         weights = checksum(policy / "model.safetensors")
@@ -128,9 +128,11 @@ class Work:
             server = ("--server", address, "--label", label)
             rows = run_tests(tested, folder, *server)
             seen = run_tests(in_libero, folder / "black", *server, "--black", "all")
-            if held_out:
-                options = (*server, "--trained-on", str(held_out.config))
-                rows += run_tests(held_out.tests, folder / "held_out", *options, plan_sha256=held_out.plan_sha256)
+            if held_out_tests:
+                options = (*server, "--trained-on", str(held_out_tests.config))
+                rows += run_tests(
+                    held_out_tests.tests, folder / "held_out", *options, plan_sha256=held_out_tests.plan_sha256
+                )
             reading = evaluation.run_instructed_episodes(self.experiment, address, folder / "reading")
         dataset = episodes.read(self.dataset(arm))
         losses = (policy / "training.jsonl").read_text().splitlines()
@@ -141,7 +143,7 @@ class Work:
             "frames": int(dataset.lengths.sum()),
             "sentences_sha256": checksum(sentences.FILE),
             "policy_sha256": weights,
-            "plan_of_all_arms_sha256": held_out.plan_sha256 if held_out else None,
+            "plan_of_all_arms_sha256": held_out_tests.plan_sha256 if held_out_tests else None,
             "losses": [[entry["step"], entry["loss"]] for entry in map(json.loads, losses[9::10])],
             "trained_with": read_json(policy / training.TRAINED_WITH, "train the policy again"),
             "packages": training.trained_with()["packages"],
@@ -175,8 +177,8 @@ class Work:
                 rows += episodes.perturbed_rows(self.dataset(arm))
             plan.write(rows, kept_plan)
         write(plan_file, kept_plan.read_bytes())
-        tests = evaluation.held_out_tests(self.experiment, own_draws.planned(plan_file))
-        return HeldOut(tests, config, own_draws.sha256_of(plan_file))
+        tests = evaluation.held_out_tests(self.experiment, held_out.planned(plan_file))
+        return HeldOut(tests, config, held_out.sha256_of(plan_file))
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -222,7 +224,7 @@ def run_tests(
     missing = [name for name in names if name not in of_test]
     if missing:
         raise PipelineError(f"{len(missing)} of {len(tests)} tests have no result, such as {missing[0]}", where=folder)
-    return [of_test[name] for name in names if of_test[name].reason != REFUSED]
+    return [of_test[name] for name in names if of_test[name].reason != REJECTED]
 
 
 def run(*words: str) -> None:

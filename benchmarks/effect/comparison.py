@@ -26,7 +26,7 @@ FURTHER = Path(__file__).with_name("further") / "results"
 SHOWN = "axes"
 """The further experiment whose tables and plot docs/effect.md shows, because it has all axes."""
 
-BESIDE = {"starts": "no_state", "goals_many": "goals", "axes_relative": "axes"}
+JOINED_WITH = {"starts": "no_state", "goals_many": "goals", "axes_relative": "axes"}
 """Further experiment to a second one whose arms join its table: both share policies, tests and demonstrations."""
 
 LINES = {
@@ -418,8 +418,8 @@ def publish(folder: Path, docs: Path = DOCS, log: Path = LOG) -> str:
     for further in sorted(FURTHER.iterdir()):
         if further.name != SHOWN:
             results = read(further)
-            if further.name in BESIDE:
-                results = join(read(FURTHER / BESIDE[further.name]), results, further)
+            if further.name in JOINED_WITH:
+                results = join(read(FURTHER / JOINED_WITH[further.name]), results, further)
             _write(log, further.name, markdown(results))
     return text
 

@@ -19,7 +19,7 @@ from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment
-from pipeline.evaluation.own_draws import ATTEMPTS, PlannedDraws, draw
+from pipeline.evaluation.held_out import ATTEMPTS, PlannedPerturbations, sample_perturbation
 from pipeline.evaluation.policies import Server, Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, balanced, goal_task, libero_task
@@ -50,7 +50,7 @@ def tested(experiment: Experiment) -> list[EvaluationTask]:
     return chosen
 
 
-def held_out_tests(experiment: Experiment, trained: PlannedDraws) -> list[EvaluationTask]:
+def held_out_tests(experiment: Experiment, trained: PlannedPerturbations) -> list[EvaluationTask]:
     """Select held-out perturbations of each task, equally for all arms.
 
     Each test has a sample that keeps its clearance from the episodes of all arms. Light has no clearance: only equal
@@ -66,8 +66,8 @@ def held_out_tests(experiment: Experiment, trained: PlannedDraws) -> list[Evalua
         candidates = Selection(source="own", suites=(task.suite,), tasks=(task.name,), axes=(axis,), episodes=episodes)
         apart: list[EvaluationTask] = []
         for test in select(candidates):
-            draws = (draw(test, candidates.seed, attempt) for attempt in range(ATTEMPTS))
-            if not all(trained.overlap(perturbation, task) for perturbation in draws):
+            samples = (sample_perturbation(test, candidates.seed, attempt) for attempt in range(ATTEMPTS))
+            if not all(trained.overlap(perturbation, task) for perturbation in samples):
                 apart.append(test)
         if len(apart) < number:
             raise PipelineError(

@@ -46,10 +46,10 @@ def main() -> None:
     losses: dict[str, dict[str, float]] = {}
     for axis in sorted(set(axes)):
         sums: dict[str, list[float]] = defaultdict(list)
-        draws = np.random.default_rng(0)
+        generator = np.random.default_rng(0)
         frames = np.flatnonzero(axes == axis)
         for _ in range(BATCHES):
-            batch = steps.of_frames(draws.choice(frames, BATCH_SIZE))
+            batch = steps.of_frames(generator.choice(frames, BATCH_SIZE))
             for name, changed in variants(batch).items():
                 with torch.inference_mode():
                     loss, _ = policy(before(changed))

@@ -35,7 +35,7 @@ from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment
-from pipeline.evaluation.own_draws import PlannedDraws, draw
+from pipeline.evaluation.held_out import PlannedPerturbations, sample_perturbation
 from pipeline.evaluation.tasks import goal_task
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
 from pipeline.libero.tasks import STEP_LIMITS, find_task
@@ -185,14 +185,14 @@ def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipp
             textures |= textures_of(perturbation)
             objects |= objects_of(perturbation)
             lights += [perturbation] if perturbation["axis"] == "light" else []
-    planned = PlannedDraws(trained)
+    planned = PlannedPerturbations(trained)
     tests = evaluation.held_out_tests(experiment, planned)
     tasks = [task.partition("/")[2] for task in experiment.tasks]
     wanted = dict.fromkeys(product(tasks, ("light", "background", "layout")), 6)
     assert Counter((test.base, test.axis) for test in tests) == wanted
     for test in tests:
         task = find_task(test.suite, test.base)
-        samples = (draw(test, 0, attempt) for attempt in range(20))
+        samples = (sample_perturbation(test, 0, attempt) for attempt in range(20))
         first = next(sample for sample in samples if not planned.overlap(sample, task))
         (content,) = json.loads(to_json([first]))
         assert textures.isdisjoint(textures_of(content))
@@ -235,7 +235,7 @@ def test_the_arms_for_gpus_are_those_of_the_table(shipped: Experiment) -> None:
         ({"evaluation": {"states": 50, "libero_plus": {"robot": 12}, "reading_states": 30}}, "398 .* at most 350"),
     ],
 )
-def test_wrong_settings_are_refused(
+def test_wrong_settings_are_rejected(
     changed: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(REPOSITORY)
@@ -245,7 +245,7 @@ def test_wrong_settings_are_refused(
         read(file)
 
 
-def test_an_arm_or_a_seed_that_there_is_not_is_refused(shipped: Experiment) -> None:
+def test_unknown_arms_and_seeds_are_rejected(shipped: Experiment) -> None:
     with pytest.raises(PipelineError, match="no arm 'other'"):
         shipped.dataset_name("other")
     with pytest.raises(PipelineError, match="no seed 7"):
@@ -278,7 +278,7 @@ def test_without_embeddings_nothing_begins(tmp_path: Path, shipped: Experiment) 
         sentences.write(["dance"], tmp_path / "bin" / "python", tmp_path / "sentences.npz")
 
 
-def test_a_task_without_embeddings_is_refused_before_any_work(tmp_path: Path) -> None:
+def test_a_task_without_embeddings_is_rejected_before_any_work(tmp_path: Path) -> None:
     run = yaml.safe_load((EFFECT / "data.yaml").read_text())
     run["demos"]["tasks"][0] = "libero_goal/put_the_bowl_on_the_stove"
     (tmp_path / "data.yaml").write_text(yaml.safe_dump(run))
@@ -340,7 +340,7 @@ def test_further_episodes_join_those_of_an_arm(tmp_path: Path, shipped: Experime
         ({}, {"run": str(EFFECT / "data_goals.yaml")}, "data_goals.yaml and .*data.yaml differ in demos"),
     ],
 )
-def test_further_episodes_that_do_not_fit_are_refused(
+def test_further_episodes_that_do_not_fit_are_rejected(
     plan: dict[str, Any], further: dict[str, str], message: str, tmp_path: Path, shipped: Experiment
 ) -> None:
     with pytest.raises(PipelineError, match=message):
@@ -358,7 +358,7 @@ def with_further(folder: Path, plan: dict[str, Any], further: dict[str, str] | N
     return read(file)
 
 
-def test_too_few_demonstrations_are_refused(shipped: Experiment) -> None:
+def test_too_few_demonstrations_are_rejected(shipped: Experiment) -> None:
     with pytest.raises(PipelineError, match="49 demonstrations of libero_goal/turn_on_the_stove, not 50"):
         episodes.planned(shipped, "ours", demonstrations(shipped, 49))
 
@@ -397,11 +397,11 @@ def small(folder: Path, demos: Path) -> Path:
 
 def numbered() -> episodes.Dataset:
     """Return two episodes of three and two steps, whose actions state the number of their step."""
-    draws = np.random.default_rng(0)
+    generator = np.random.default_rng(0)
     action = np.repeat(np.arange(5, dtype=np.float32)[:, None], 7, axis=1)
     rows = [{"instruction": text} for text in ("turn on the stove", "put the bowl on the plate")]
-    images = {view: draws.integers(0, 256, (5, 32, 32, 3), np.uint8) for view in episodes.VIEWS}
-    return episodes.Dataset(images, draws.random((5, 8), np.float32), action, np.array([3, 2]), rows)
+    images = {view: generator.integers(0, 256, (5, 32, 32, 3), np.uint8) for view in episodes.VIEWS}
+    return episodes.Dataset(images, generator.random((5, 8), np.float32), action, np.array([3, 2]), rows)
 
 
 @pytest.mark.slow
@@ -427,8 +427,8 @@ def test_a_batch_has_the_actions_that_follow_and_the_instruction(
 
 def test_relative_states_do_not_depend_on_the_place_of_the_episode() -> None:
     """All states are moved by one rotation and one translation, computed by matrices of MuJoCo."""
-    draws = np.random.default_rng(0)
-    states = draws.uniform(-1, 1, (6, 8)).astype(np.float32)
+    generator = np.random.default_rng(0)
+    states = generator.uniform(-1, 1, (6, 8)).astype(np.float32)
     turn = matrix(np.array([0.3, -1.0, 0.7]))
     moved = states.copy()
     for state, place in zip(states, moved, strict=True):

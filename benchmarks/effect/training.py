@@ -165,9 +165,9 @@ class Steps:
         self._sentences = np.stack([vector(row["instruction"], vectors) for row in dataset.episodes])
         self._episode = np.repeat(np.arange(len(dataset.lengths)), dataset.lengths)
 
-    def batch(self, draws: np.random.Generator, size: int) -> Batch:
+    def batch(self, generator: np.random.Generator, size: int) -> Batch:
         """Sample frames with replacement; return them before normalisation."""
-        return self.of_frames(draws.integers(len(self._ends), size=size))
+        return self.of_frames(generator.integers(len(self._ends), size=size))
 
     def of_frames(self, frames: NDArray[np.int64]) -> Batch:
         """Return the frames with these numbers, counted over all episodes, before normalisation."""

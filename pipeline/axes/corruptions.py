@@ -199,10 +199,10 @@ def _scatter(frame: Frame, offsets: NDArray[np.int8], delta_px: int) -> None:
         offsets: (passes, H, W, 2) from each pixel to the pixel that replaces it: rows down, columns right.
     """
     height, width, _ = frame.shape
-    for drawn in offsets:
+    for pass_offsets in offsets:
         for y in range(height - delta_px, delta_px, -1):
             for x in range(width - delta_px, delta_px, -1):
-                frame[y, x] = frame[y + drawn[y, x, 0], x + drawn[y, x, 1]]
+                frame[y, x] = frame[y + pass_offsets[y, x, 0], x + pass_offsets[y, x, 1]]
 
 
 class Glass(Frozen):

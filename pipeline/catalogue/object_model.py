@@ -204,7 +204,7 @@ class ObjectModel:
         A geom that collides and is visible gives two geoms. Visual geoms have no mass.
         """
         placed = list(_placed(self._root.findall("worldbody/body"), np.array(shift_m, float), _UPRIGHT[self.up]))
-        visible = _drawn([geom for geom, _, _ in placed])
+        visible = _visible_geoms([geom for geom, _, _ in placed])
         for geom, pos, quat in placed:
             shape = {key: value for key, value in geom.attrib.items() if key in ("type", "mesh", "size")}
             shape |= {"pos": _numbers(pos), "quat": _numbers(quat)}
@@ -279,7 +279,7 @@ def _is_visual(geom: ET.Element) -> bool:
     return geom.get("contype") == "0" and geom.get("conaffinity") == "0"
 
 
-def _drawn(geoms: Sequence[ET.Element]) -> list[ET.Element]:
+def _visible_geoms(geoms: Sequence[ET.Element]) -> list[ET.Element]:
     """Return the visible geoms: the geoms that MuJoCo's viewer shows.
 
     If the model has visual geoms, its colliding geoms with an explicit group 0 are not visible: robosuite, and

@@ -18,8 +18,8 @@ from pipeline.libero.assets import installed, name_of
 from pipeline.origins import REINSTALL
 
 _OBJECTS, _HASH = "objects/", "#sha256="
-# The pattern matches attributes in ElementTree's notation. Besides file, a cube texture has fileright, fileleft and so
-# on. The pattern begins with letters, so that searching takes a tenth of the time.
+# The pattern matches attributes in ElementTree's notation. In addition to file, a cube texture has fileright, fileleft
+# and so on. The pattern begins with letters, so that searching takes a tenth of the time.
 _FILE = re.compile(r'(file(?<=\sfile)\w*)="([^"]*)"')
 
 

@@ -73,7 +73,7 @@ def test_images() -> frozenset[str]:
 test_images.__test__ = False  # type: ignore[attr-defined]  # not a test case, whatever its name starts with
 
 
-def refusal(name: str, sha256: str) -> str | None:
+def why_rejected(name: str, sha256: str) -> str | None:
     """Return the reason why an image must not be sampled; `None` if it may be sampled."""
     if sha256 in test_images():
         return "its bytes are those of an image that test tasks show"
@@ -98,7 +98,7 @@ def catalogue(sources: tuple[Source, ...]) -> dict[str, Texture]:
     seen: set[str] = set()
     for source in sources:
         for texture in offered(source):
-            if texture.sha256 not in seen and _may_be_drawn(texture, source):
+            if texture.sha256 not in seen and _may_be_sampled(texture, source):
                 seen.add(texture.sha256)
                 by_name[texture.name] = texture
     return by_name
@@ -134,13 +134,13 @@ def pixels(name: str, sha256: str) -> Frame:
     return image
 
 
-def _may_be_drawn(texture: Texture, source: Source) -> bool:
+def _may_be_sampled(texture: Texture, source: Source) -> bool:
     """Return whether a package's image may be sampled.
 
     Raises:
         PipelineError: when a user's image may not be sampled, or is not readable.
     """
-    reason = refusal(texture.name, texture.sha256)
+    reason = why_rejected(texture.name, texture.sha256)
     if isinstance(source, Folder):
         if reason is not None:
             raise unusable(texture, reason)

@@ -170,13 +170,13 @@ def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on
     only an evaluation of the candidates shows it: with --results, these tasks are left out. The last line of the output
     is JSON.
     """
-    from pipeline.evaluation import own_draws, selection
+    from pipeline.evaluation import held_out, selection
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.task_list import reject_other_list, write_tasks
 
     reject_other_list(out)
     rows = [row for row, _ in stored(results)]
-    plan = own_draws.planned(open_run(trained_on).plan_file) if trained_on else None
+    plan = held_out.planned(open_run(trained_on).plan_file) if trained_on else None
     candidates = selection.candidates(seed)
     chosen, counts = selection.construct(candidates, seed, size or selection.SIZE, rows, plan)
     write_tasks(chosen, seed, out)
@@ -223,7 +223,7 @@ def leakage(results: Path, config: Path) -> int:
     a perturbation overlaps with the plan, or if the plan trains on a goal.
     """
     from pipeline.axes import from_json
-    from pipeline.evaluation import own_draws
+    from pipeline.evaluation import held_out
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.tasks import goal_task
     from pipeline.libero.tasks import find_task
@@ -241,8 +241,8 @@ def leakage(results: Path, config: Path) -> int:
         raise PipelineError(
             "the results have no held-out perturbations and goals", where=results, remedy="run `evaluate --source own`"
         )
-    planned = own_draws.planned(open_run(config).plan_file)
-    findings = own_draws.compare(perturbations, planned)
+    planned = held_out.planned(open_run(config).plan_file)
+    findings = held_out.compare(perturbations, planned)
     if goals:
         findings["goals"] = {"draws": len(goals), "overlaps": sum(goal in planned.goals for goal in goals)}
     print(json.dumps(findings))

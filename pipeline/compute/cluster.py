@@ -60,7 +60,7 @@ class Workplace:
 
         faults = self.faults(get_worker())
         if faults:
-            raise _refusal(f"worker on {platform.node()}", faults)
+            raise _rejection(f"worker on {platform.node()}", faults)
         _forget()
         _entered = self
 
@@ -148,13 +148,13 @@ def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
                 rejected.update(addresses_of_fault)
                 # Three addresses of each fault are enough to find the machines.
                 faults.append(f"{', '.join(addresses_of_fault[:3])} {fault}")
-            raise _refusal(f"{len(rejected)} of {len(reports)} workers", faults)
+            raise _rejection(f"{len(rejected)} of {len(reports)} workers", faults)
         yield workplace
     finally:
         token.unlink(missing_ok=True)
 
 
-def _refusal(where: str, faults: list[str]) -> PipelineError:
+def _rejection(where: str, faults: list[str]) -> PipelineError:
     return PipelineError(
         "; ".join(faults),
         where=where,

@@ -182,12 +182,12 @@ def _try(script: str) -> None:
     """
     try:
         answer = subprocess.run(["sbatch", "--test-only"], input=script, capture_output=True, text=True, check=False)
-        refusal = answer.stderr.strip() if answer.returncode else ""
+        rejection = answer.stderr.strip() if answer.returncode else ""
     except FileNotFoundError as error:
-        refusal = str(error)
-    if refusal:
+        rejection = str(error)
+    if rejection:
         raise PipelineError(
-            f"SLURM rejects the job ({refusal})",
+            f"SLURM rejects the job ({rejection})",
             where="sbatch",
             expected="a machine that can submit SLURM jobs, and options that SLURM knows",
             remedy="correct compute.slurm, or set compute.cluster: local",

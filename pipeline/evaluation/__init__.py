@@ -5,5 +5,5 @@ Modules, each listed above the modules that it uses:
 * ``harness``: for vla-eval. ``lerobot_eval``: for lerobot-eval, over ``gym_environment``. ``composition``: the gap.
 * ``evaluate``: all episodes, in worker processes. ``rollout``: one episode, from task to row. ``selection``: tasks.
 * ``environment`` over ``simulator``: starts episodes, observes, takes actions. ``reference_policies``, ``policies``.
-* ``statistics``, ``results``; ``libero_plus``, ``own_draws``, ``tasks``: sources of tasks, and their identification.
+* ``statistics``, ``results``; ``libero_plus``, ``held_out``, ``tasks``: sources of tasks, and their identification.
 """

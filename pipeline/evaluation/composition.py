@@ -31,7 +31,7 @@ from scipy.stats import chi2_contingency
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import (
-    REFUSED,
+    REJECTED,
     EpisodeResult,
     Stored,
     one_setting,
@@ -141,7 +141,7 @@ def pairs(results: Iterable[Stored]) -> list[Pair]:
         PipelineError: if the results have several policies or settings, or two episodes of a task, or if no trial is
             complete.
     """
-    of_pairs = [(row, files) for row, files in results if row.source in ("libero", "own") and row.reason != REFUSED]
+    of_pairs = [(row, files) for row, files in results if row.source in ("libero", "own") and row.reason != REJECTED]
     one_setting(of_pairs)
     reject_different(of_pairs)
     reject_repeated_tasks(of_pairs)

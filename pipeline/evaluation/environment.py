@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import AXES, Perturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RejectedError
-from pipeline.evaluation import libero_plus, own_draws
+from pipeline.evaluation import held_out, libero_plus
 from pipeline.evaluation.actions import Actions, checked_actions
 from pipeline.evaluation.policies import VIEWS, StateAngle, Wanted
 from pipeline.evaluation.recordings import demonstration
-from pipeline.evaluation.results import REFUSED
+from pipeline.evaluation.results import REJECTED
 from pipeline.evaluation.simulator import Picture, Simulator
 from pipeline.evaluation.tasks import CARRIED, EvaluationTask, Prompt, find_replacement, goal_task, libero_states
 from pipeline.libero.starts import recorded_start
@@ -94,7 +94,7 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     @field_serializer("plan")
     def _name_by_content(self, plan: Path) -> str:
         """Serialise the plan as the SHA-256 of its file."""
-        return own_draws.sha256_of(plan)
+        return held_out.sha256_of(plan)
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class EpisodeEnvironment:
             starts.get(task.source, self._start_libero)()
             self.progress = Progress(reason="running")
         except RejectedError as error:
-            self.progress = Progress(reason=REFUSED if task.source == "own" else error.reason)
+            self.progress = Progress(reason=REJECTED if task.source == "own" else error.reason)
         return self.progress
 
     def step(self, action: ArrayLike) -> Progress:
@@ -300,8 +300,8 @@ class EpisodeEnvironment:
 
         scene = None
         if self.task.source == "own":
-            planned = None if self.settings.plan is None else own_draws.planned(self.settings.plan)
-            self.perturbations, scene = own_draws.drawn_scene(
+            planned = None if self.settings.plan is None else held_out.planned(self.settings.plan)
+            self.perturbations, scene = held_out.held_out_scene(
                 self.task, self.settings.seed, demo, nominal, planned, self._picture.opened
             )
         if scene is None and not recorded:

@@ -16,7 +16,7 @@ from pipeline import gl
 from pipeline.axes import AXES
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
-from pipeline.evaluation import own_draws, recordings
+from pipeline.evaluation import held_out, recordings
 from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Policy, warn_of_requests
@@ -104,7 +104,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
 
 def not_trained(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
     """Leave out goals that a training plan carries to the same scenes, and print their number."""
-    goals = set() if plan is None else own_draws.planned(plan).goals
+    goals = set() if plan is None else held_out.planned(plan).goals
     left = [task for task in wanted if task.source != "goals" or goal_task(task)[1] not in goals]
     if len(left) < len(wanted):
         print(f"left out, because the plan trains on them: {len(wanted) - len(left)} of {len(wanted)} goals")
@@ -147,7 +147,7 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
             expected="one seed for both",
         )
     if settings.plan is not None:
-        own_draws.sha256_of(settings.plan)
+        held_out.sha256_of(settings.plan)
         if not any(task.source in ("own", "goals") for task in wanted):
             raise PipelineError(
                 "no task has held-out perturbations to compare with a plan",

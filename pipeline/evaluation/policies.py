@@ -450,15 +450,15 @@ def _is_loaded(tensor: Any, stored: Any) -> bool:
     return bool(tensor.shape == stored.shape and (tensor.cpu() == stored.to(tensor.dtype)).all())
 
 
-BESIDE = ("train_config.json", "README.md")
+WITHOUT_EFFECT = ("train_config.json", "README.md")
 """Files of a checkpoint that do not affect its actions."""
 
 
 def content_of(checkpoint: Path) -> str:
     """Compute a digest of a checkpoint: the names and SHA-256 sums of the files in its folder.
 
-    The digest includes configuration, weights, processors and other files, but not ``BESIDE`` and hidden files. It does
-    not include files that lerobot loads from other places, such as a tokenizer.
+    The digest includes configuration, weights, processors and other files, but not ``WITHOUT_EFFECT`` and hidden
+    files. It does not include files that lerobot loads from other places, such as a tokenizer.
 
     Raises:
         PipelineError: if the folder is not a checkpoint.
@@ -471,6 +471,6 @@ def content_of(checkpoint: Path) -> str:
     for path in checkpoint.rglob("*"):
         name = path.relative_to(checkpoint)
         hidden = any(part.startswith(".") for part in name.parts)
-        if path.is_file() and not hidden and name.name not in BESIDE:
+        if path.is_file() and not hidden and name.name not in WITHOUT_EFFECT:
             checksums[name.as_posix()] = checksum(path)
     return digest(checksums)

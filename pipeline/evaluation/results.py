@@ -15,7 +15,7 @@ from pipeline.files import is_temporary, read_json, reject_other_file, write
 from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
-REFUSED = "refused"
+REJECTED = "refused"
 """Reason of an episode that could not begin, because its scene rejects the perturbation."""
 
 ALIKE = {"actions": "delta", "black": "none", "initial_states": "libero", "fixture_seed": 0}
@@ -321,14 +321,14 @@ class Evaluated:
         name: the policy's name, with the settings that differ from the policy's other results.
         rows: the episodes, without those in which no policy acted.
         videos: name of an episode to its video, for episodes with a video.
-        refused: number of episodes that could not begin, because their scene rejected the perturbation.
+        rejected: number of episodes that could not begin, because their scene rejected the perturbation.
     """
 
     name: str
     settings: Mapping[str, Any]
     rows: Sequence[EpisodeResult]
     videos: Mapping[str, Path]
-    refused: int
+    rejected: int
 
     def from_source(self, source: str) -> list[EpisodeResult]:
         """Return the episodes on the tasks of one source."""
@@ -377,7 +377,7 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
     Raises:
         PipelineError: if a task has two episodes.
     """
-    acted = [(row, files) for row, files in group if row.reason != REFUSED]
+    acted = [(row, files) for row, files in group if row.reason != REJECTED]
     reject_repeated_tasks(acted)
     settings = group[0][0].settings
     name_parts = [alike[0].policy]
@@ -391,5 +391,5 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
         settings=settings,
         rows=[row for row, _ in acted],
         videos={episode: path for episode, path in videos.items() if path.is_file()},
-        refused=len(group) - len(acted),
+        rejected=len(group) - len(acted),
     )

@@ -16,7 +16,7 @@ from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.component_names import stored_names
 from pipeline.errors import PipelineError
-from pipeline.evaluation import libero_plus, own_draws, recordings
+from pipeline.evaluation import held_out, libero_plus, recordings
 from pipeline.evaluation.actions import checked_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
@@ -188,7 +188,7 @@ class Evaluation:
             if contents:
                 versions["files of the benchmark"] = digest(contents)[:16]
         if task.source == "own":
-            versions["draws"] = own_draws.first_draws(task, self.settings.seed)
+            versions["draws"] = held_out.digest_first_perturbations(task, self.settings.seed)
         base, demos = find_task(task.suite, task.base), self.settings.demos
         if task.suite not in SUITES:
             versions["definition of the task"] = checksum_of(edition(base.bddl_file))[:16]
@@ -208,8 +208,8 @@ class Evaluation:
             wanted: the parts of an observation that the policy asked for.
         """
         task, progress = environment.task, environment.progress
-        held_out = environment.perturbations if task.source == "own" else ()
-        component = "+".join(perturbation.component for perturbation in held_out) or task.component
+        perturbations = environment.perturbations if task.source == "own" else ()
+        component = "+".join(perturbation.component for perturbation in perturbations) or task.component
         self.files.save(
             EpisodeResult(
                 **asdict(task) | {"component": component},
@@ -222,7 +222,7 @@ class Evaluation:
                 reason=progress.reason,
                 steps=progress.steps,
                 looks=environment.looks,
-                perturbations=json.loads(to_json(held_out)),
+                perturbations=json.loads(to_json(perturbations)),
                 policy=self.policy.name(self.identity),
                 identity=self.identity,
                 settings={**self.settings.model_dump(), **wanted._asdict()},

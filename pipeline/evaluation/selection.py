@@ -21,8 +21,8 @@ from pipeline.axes.base import LEVELS
 from pipeline.axes.component_names import ComponentName
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
-from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_task
-from pipeline.evaluation.results import REFUSED, EpisodeResult
+from pipeline.evaluation.held_out import OWN_AXES, PlannedPerturbations, held_out_task, sample_perturbation
+from pipeline.evaluation.results import REJECTED, EpisodeResult
 from pipeline.evaluation.task_list import read_tasks
 from pipeline.evaluation.tasks import EvaluationTask, balanced, carried_tasks, libero_task, replacements
 from pipeline.libero.tasks import SUITES, find_task, suites, tasks
@@ -195,8 +195,8 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
                     yield from carried_tasks(task, number)
                 case "own":
                     kinds = product(selection.axes or OWN_AXES, selection.levels or LEVELS)
-                    drawn = (drawn_task(task, axis, level, number, selection.seed) for axis, level in kinds)
-                    yield from filter(None, drawn)
+                    sampled = (held_out_task(task, axis, level, number, selection.seed) for axis, level in kinds)
+                    yield from filter(None, sampled)
                 case "pairs":
                     yield from _pairs(task, place + number, number, selection)
 
@@ -212,9 +212,9 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
     level = levels[turn % len(levels)]
     yield libero_task(task, number)
     for axis in (*axes, *pairs):
-        drawn = drawn_task(task, axis, level, number, selection.seed)
-        if drawn is not None:
-            yield drawn
+        perturbed = held_out_task(task, axis, level, number, selection.seed)
+        if perturbed is not None:
+            yield perturbed
 
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
@@ -305,31 +305,31 @@ def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
 
     No scene is built.
     """
-    drawn: list[EvaluationTask] = []
+    sampled: list[EvaluationTask] = []
     tested = [axis for axis in OWN_AXES if load().on_axis(axis)]
     for suite, axis in product(TESTED_SUITES, tested):
-        drawn += islice(_drawn_tasks(suite, axis, seed), each)
-    return drawn
+        sampled += islice(_held_out_tasks(suite, axis, seed), each)
+    return sampled
 
 
-def _drawn_tasks(suite: str, axis: str, seed: int) -> Iterator[EvaluationTask]:
+def _held_out_tasks(suite: str, axis: str, seed: int) -> Iterator[EvaluationTask]:
     """Yield a suite's tasks with held-out perturbations on one axis, without end.
 
     The number of a perturbation increases after all tasks and levels had one, so initial states differ too.
     """
     for number in count():
         for level, task in product(LEVELS, tasks(suite)):
-            drawn = drawn_task(task, axis, level, number, seed)
-            if drawn is not None:
-                yield drawn
+            perturbed = held_out_task(task, axis, level, number, seed)
+            if perturbed is not None:
+                yield perturbed
 
 
 def construct(
-    drawn: Sequence[EvaluationTask],
+    sampled: Sequence[EvaluationTask],
     seed: int,
     size: int = SIZE,
     results: Iterable[EpisodeResult] = (),
-    plan: PlannedDraws | None = None,
+    plan: PlannedPerturbations | None = None,
 ) -> tuple[list[EvaluationTask], dict[str, Any]]:
     """Filter candidates, and choose tasks evenly: axes in turn, for each axis its components, then levels, then suites.
 
@@ -350,16 +350,20 @@ def construct(
             raise PipelineError(
                 f"the result has seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
             )
-        if row.reason == REFUSED:
+        if row.reason == REJECTED:
             rejected.add(str(row))
-    accepted = [task for task in drawn if str(task) not in rejected]
+    accepted = [task for task in sampled if str(task) not in rejected]
     apart = accepted
     if plan is not None:
-        apart = [task for task in accepted if not plan.overlap(draw(task, seed), find_task(task.suite, task.base))]
+        apart = [
+            task
+            for task in accepted
+            if not plan.overlap(sample_perturbation(task, seed), find_task(task.suite, task.base))
+        ]
     chosen = balanced(apart, size, seed)
     return chosen, {
-        "candidates": len(drawn),
-        "refused": len(drawn) - len(accepted),
+        "candidates": len(sampled),
+        "refused": len(sampled) - len(accepted),
         "overlapping": len(accepted) - len(apart),
         "tasks": len(chosen),
         "by_axis": dict(sorted(Counter(task.axis for task in chosen).items())),

@@ -31,9 +31,9 @@ from scipy.stats import binomtest, norm, t
 
 from pipeline import seeding
 from pipeline.errors import PipelineError
-from pipeline.evaluation.own_draws import drawn_task
+from pipeline.evaluation.held_out import held_out_task
 from pipeline.evaluation.results import (
-    REFUSED,
+    REJECTED,
     EpisodeResult,
     Stored,
     Trial,
@@ -71,7 +71,7 @@ def summary(rows: Iterable[EpisodeResult]) -> dict[str, Any]:
     Episodes whose scene was rejected are only counted, because no policy acted in them.
     """
     every = list(rows)
-    acted = [row for row in every if row.reason != REFUSED]
+    acted = [row for row in every if row.reason != REJECTED]
     rates: dict[str, Any] = {"all": success_rate(acted), "refused": len(every) - len(acted)}
     for columns in GROUPINGS:
         groups = grouped((_group_name(row, columns), row) for row in acted)
@@ -164,9 +164,9 @@ def _percentiles(
     freedom = len(sums) - len(groups)
     if freedom < 1:
         return None, None, None
-    draws = seeding.rng("evaluation", "bootstrap")
+    generator = seeding.rng("evaluation", "bootstrap")
     # Rounded, so that figures that are 0 apart from floating-point errors count as 0.
-    figures = np.round(statistic(np.sum([_drawn(group, draws) for group in groups], axis=0)), 12)
+    figures = np.round(statistic(np.sum([_resampled(group, generator) for group in groups], axis=0)), 12)
     if bool(np.isnan(figures).any()) or figures.min() == figures.max():
         return None, None, None
     outside = norm.cdf(t.ppf(0.025, freedom))
@@ -176,7 +176,7 @@ def _percentiles(
     return float(low), float(high), min(1.0, float(p_value))
 
 
-def _drawn(group: Floats, draws: np.random.Generator) -> Floats:
+def _resampled(group: Floats, generator: np.random.Generator) -> Floats:
     """Resample the units of a stratum.
 
     Each resample has one unit less than the stratum, and its sums are scaled to the stratum's number of units.
@@ -184,7 +184,7 @@ def _drawn(group: Floats, draws: np.random.Generator) -> Floats:
     Returns:
         (RESAMPLES, outcomes) scaled sums.
     """
-    picked = draws.integers(len(group), size=(RESAMPLES, len(group) - 1), dtype=np.int32)
+    picked = generator.integers(len(group), size=(RESAMPLES, len(group) - 1), dtype=np.int32)
     sums = np.stack([outcome[picked].sum(axis=1) for outcome in np.ascontiguousarray(group.T)], axis=1)
     return np.asarray(sums * (len(group) / (len(group) - 1)), float)
 
@@ -281,7 +281,7 @@ def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
     reject_different(chain(*results))
     models: list[dict[Trial, bool]] = []
     for model_results in results:
-        models.append({row.trial: row.success for row, _ in model_results if row.reason != REFUSED})
+        models.append({row.trial: row.success for row, _ in model_results if row.reason != REJECTED})
     graded: list[dict[str, Any]] = []
     for trial in models[0]:
         if not all(trial in model for model in models):
@@ -302,4 +302,4 @@ def _asked(task: EvaluationTask, seed: int) -> EvaluationTask:
     """
     if task.source != "own":
         return task
-    return drawn_task(find_task(task.suite, task.base), task.axis, task.level, task.number, seed) or task
+    return held_out_task(find_task(task.suite, task.base), task.axis, task.level, task.number, seed) or task

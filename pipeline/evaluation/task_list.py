@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.own_draws import first_draws
+from pipeline.evaluation.held_out import digest_first_perturbations
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import reject_other_file, write
 from pipeline.seeding import digest
@@ -28,9 +28,9 @@ class TaskList(BaseModel):
     draws: str = ""
     tasks: list[EvaluationTask]
 
-    def drawn(self) -> str:
+    def digest_perturbations(self) -> str:
         """Compute ``draws`` with this version; empty without held-out perturbations."""
-        digests = [first_draws(task, self.seed) for task in self.tasks if task.source == "own"]
+        digests = [digest_first_perturbations(task, self.seed) for task in self.tasks if task.source == "own"]
         return digest(*digests)[:16] if digests else ""
 
 
@@ -42,7 +42,7 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
     """
     try:
         listed = TaskList.model_validate_json(file.read_bytes())
-        drawn = listed.drawn()
+        perturbations_digest = listed.digest_perturbations()
     except (OSError, ValueError, LookupError) as error:
         raise PipelineError(
             f"the file is not a list of tasks ({error})", where=file, expected="a file that `analyze construct` wrote"
@@ -51,7 +51,7 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
         raise PipelineError(
             f"these tasks were sampled under seed {listed.seed}, not {seed}", where=file, remedy=f"--seed {listed.seed}"
         )
-    if listed.draws != drawn:
+    if listed.draws != perturbations_digest:
         raise PipelineError(
             "this version samples other perturbations for these tasks",
             where=file,
@@ -73,6 +73,6 @@ def reject_other_list(file: Path) -> None:
 def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
     """Write a list of tasks that ``evaluate --tasks-from`` reads."""
     content = [task if isinstance(task, dict) else asdict(task) for task in listed]
-    drawn = TaskList.model_validate({"seed": seed, "tasks": content}).drawn()
+    perturbations_digest = TaskList.model_validate({"seed": seed, "tasks": content}).digest_perturbations()
     lines = ",\n".join(map(json.dumps, content))
-    write(file, f'{{"seed": {seed}, "draws": "{drawn}", "tasks": [\n{lines}\n]}}\n')
+    write(file, f'{{"seed": {seed}, "draws": "{perturbations_digest}", "tasks": [\n{lines}\n]}}\n')

@@ -246,8 +246,8 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
         if target_categories.count(scene.objects[old]) > 1:
             continue  # "both moka pots" has no words for one of them
         relation, place = next((fact[0], fact[2]) for fact in scene.goal if fact[1] == old)
-        beside = scene.beside(place)
-        taken = {*scene.receptacles, *carrying, *named, *(beside.things if beside else ())}
+        neighbours = scene.neighbours(place)
+        taken = {*scene.receptacles, *carrying, *named, *(neighbours.things if neighbours else ())}
         for new, category in scene.objects.items():
             if new in taken or categories.count(category) > 1 or not _fits(category, relation, place, scene):
                 continue

@@ -16,7 +16,7 @@ from pipeline.errors import PipelineError
 from pipeline.origins import REINSTALL
 
 # Elements by which a document makes MuJoCo open a file or run a plugin of the document's choice.
-_REFUSED = {"include", "model", "attach", "plugin", "extension"}
+_REJECTED = {"include", "model", "attach", "plugin", "extension"}
 # Attributes that make MuJoCo search another folder than the folder that a file attribute names.
 _REDIRECTS = ("assetdir", "meshdir", "texturedir", "strippath")
 
@@ -66,7 +66,7 @@ def relocate(xml: str, where: str) -> str:
             its content can reach other files (includes, plugins, entities).
     """
 
-    def refuse(
+    def rejection(
         what: str, remedy: str = "do not use this file: LIBERO's own recordings have no such content"
     ) -> PipelineError:
         """Return the error that rejects the model."""
@@ -74,36 +74,36 @@ def relocate(xml: str, where: str) -> str:
 
     # Entities can only be declared in a DOCTYPE, and no recording has one.
     if "<!DOCTYPE" in xml:
-        raise refuse("the model has a DOCTYPE, which can include other files")
+        raise rejection("the model has a DOCTYPE, which can include other files")
     try:
         root = ET.fromstring(xml)
     except (ET.ParseError, ValueError) as error:
-        raise refuse(
+        raise rejection(
             f"the model is not XML ({error})",
             "compare the file with the one that it was copied from, and copy or download it again into another folder",
         ) from error
     if root.tag != "mujoco":
-        raise refuse(f"the model is a <{root.tag}>, not a <mujoco>")
+        raise rejection(f"the model is a <{root.tag}>, not a <mujoco>")
     for element in root.iter():
         # MuJoCo matches <include> without regard to case.
-        if element.tag.lower() in _REFUSED:
-            raise refuse(f"the model has an <{element.tag}> element")
+        if element.tag.lower() in _REJECTED:
+            raise rejection(f"the model has an <{element.tag}> element")
         if element.tag == "compiler":
             for name in _REDIRECTS:
                 element.attrib.pop(name, None)
         for name, value in element.items():
-            # Besides file, a cube texture has fileright, fileleft and so on.
+            # In addition to file, a cube texture has fileright, fileleft and so on.
             if name.lower().startswith("file"):
                 try:
                     element.set(name, installed(value))
                 except (OSError, ValueError) as error:
                     described = f'<{element.tag} name="{element.get("name", "")}"> {name}="{value}"'
-                    raise refuse(f"{described}: {error}", "check that LIBERO's assets are complete") from error
+                    raise rejection(f"{described}: {error}", "check that LIBERO's assets are complete") from error
     as_evaluated(root)
     try:
         return ET.tostring(root, encoding="unicode")
     except RecursionError as error:
-        raise refuse("the model is nested too deeply") from error
+        raise rejection("the model is nested too deeply") from error
 
 
 def as_evaluated(mujoco_root: ET.Element) -> None:

@@ -28,7 +28,7 @@ REGION_WORDS = {"cookies": "box", "flat_stove": "stove", "glazed_rim_porcelain_r
 """Category to the other word that the names of LIBERO's regions use for it."""
 
 
-class Beside(NamedTuple):
+class Neighbours(NamedTuple):
     """Meaning of the name of a region of the working surface.
 
     Attributes:
@@ -140,7 +140,7 @@ class Bddl:
         owners = [thing for thing in (*self.objects, *self.fixtures) if f"{name}_".startswith(f"{thing}_")]
         return max(owners, key=len, default=None)
 
-    def beside(self, region: str) -> Beside | None:
+    def neighbours(self, region: str) -> Neighbours | None:
         """Parse the name of a region of the working surface; return `None` if it names no thing.
 
         Without surface and relation, the rest of the name must be the thing's name, its category or its word in
@@ -152,17 +152,17 @@ class Bddl:
             return None
         words = region.removeprefix(f"{surface}_").removesuffix("_region")
         if words.startswith("next_to_"):
-            return self._beside("next to", words.removeprefix("next_to_"))
+            return self._neighbours("next to", words.removeprefix("next_to_"))
         if words.startswith("between_"):
             parts = words.removeprefix("between_").split("_")
             for length in range(1, len(parts)):
                 first, second = "_".join(parts[:length]), "_".join(parts[length:])
-                between = self._beside("between", first, second)
+                between = self._neighbours("between", first, second)
                 if between is not None:
                     return between
             return None
         words, _, side = words.rpartition("_")
-        return self._beside(side, words)
+        return self._neighbours(side, words)
 
     @property
     def goal_regions(self) -> dict[str, str]:
@@ -172,9 +172,9 @@ class Bddl:
         """
         things = {}
         for region in [fact[2] for fact in self.goal if len(fact) > 2]:
-            beside = self.beside(region)
-            if beside is not None and len(beside.things) == 1:
-                things[region] = beside.things[0]
+            neighbours = self.neighbours(region)
+            if neighbours is not None and len(neighbours.things) == 1:
+                things[region] = neighbours.things[0]
         return things
 
     @property
@@ -247,7 +247,7 @@ class Bddl:
             parts.append(f"on {self.category(owner)}{part}")
         return " ".join(parts)
 
-    def _beside(self, relation: str, *words: str) -> Beside | None:
+    def _neighbours(self, relation: str, *words: str) -> Neighbours | None:
         """Return the things that some words refer to; `None` unless each word refers to exactly one thing."""
         things = []
         for word in words:
@@ -255,7 +255,7 @@ class Bddl:
             if thing is None:
                 return None
             things.append(thing)
-        return Beside(relation, tuple(things))
+        return Neighbours(relation, tuple(things))
 
     def _called(self, word: str) -> str | None:
         """Return the thing that a word of a region's name refers to; `None` if it refers to no or to several things.

@@ -234,10 +234,10 @@ class _Scene:
         words = self._region(place)[1]
         neighbours = [neighbour for neighbour in self._named(words) if neighbour not in (kind, host)]
         phrases = (("between", "between"), ("next", "next to"))
-        relation_beside = next((phrase for word, phrase in phrases if word in words), part)
-        if neighbours and relation_beside:
+        relation_to_neighbour = next((phrase for word, phrase in phrases if word in words), part)
+        if neighbours and relation_to_neighbour:
             for neighbour in neighbours:
-                yield Aim(relation_beside, kind, neighbour)
+                yield Aim(relation_to_neighbour, kind, neighbour)
         elif part:
             yield Aim(None, kind, None, part)
 
@@ -278,10 +278,10 @@ def _anchors(task: Task, thing: str) -> tuple[str, ...]:
     Return no things if the object starts elsewhere.
     """
     scene = definition_of(task)
-    beside = scene.beside(scene.places.get(thing, ""))
-    if beside is None or beside.relation not in ("next to", "between"):
+    neighbours = scene.neighbours(scene.places.get(thing, ""))
+    if neighbours is None or neighbours.relation not in ("next to", "between"):
         return ()
-    return beside.things
+    return neighbours.things
 
 
 def relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:
@@ -306,6 +306,6 @@ def relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bo
         case (first, second):
             line = xy_m(second) - xy_m(first)
             dx, dy = target_m - xy_m(first)
-            along, beside = np.array([dx * line[0] + dy * line[1], dx * line[1] - dy * line[0]]) / (line @ line)
-            return bool(BETWEEN <= along <= 1 - BETWEEN and abs(beside) <= BETWEEN)
+            along, across = np.array([dx * line[0] + dy * line[1], dx * line[1] - dy * line[0]]) / (line @ line)
+            return bool(BETWEEN <= along <= 1 - BETWEEN and abs(across) <= BETWEEN)
     return True

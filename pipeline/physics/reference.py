@@ -39,7 +39,7 @@ class Reference:
         positions_m: (K+1, 3) positions of the grip site in the world's frame.
         rotations: K+1 orientations of the grip site in the world's frame.
         actions: (K, 7).
-        busy: (K+1,) True while the hand, or an object in it, touches anything besides the carried object.
+        busy: (K+1,) True while the hand, or an object in it, touches anything other than the carried object.
         engaged: (K+1,) ``busy`` without the hand's own contacts with the working surface, which never moves.
         held: object to mask (K+1,), True while the robot touches it.
         carried: object to mask (K+1,).

@@ -1,7 +1,7 @@
 """Rendering of states to frames.
 
 The plain path of one frame has four parts. ``Renderer.perturbed`` and ``Renderer.restore`` set up the scene.
-``PlainDrawing.frame`` renders it. ``frames_of`` adds noise and turns the frame. ``images.jpeg.encode`` encodes it as a
+``PlainRenderer.frame`` renders it. ``frames_of`` adds noise and turns the frame. ``images.jpeg.encode`` encodes it as a
 JPEG file. ``render`` follows this path for all steps and streams of a trajectory. OpenGL is chosen when the first
 renderer is created.
 """

@@ -16,7 +16,7 @@ from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero.carried import definition_of
 from pipeline.planning.streams import Stream
-from pipeline.rendering.drawing import Surfaces
+from pipeline.rendering.plain_renderer import Surfaces
 from pipeline.rendering.renderer import Renderer
 from pipeline.scenes.placement import added_names, added_objects
 from pipeline.types import Extra, Floats, Geometry, Task, Trajectory
@@ -145,7 +145,7 @@ def matrices(renderer: Renderer, view: str) -> tuple[NDArray[np.float32], NDArra
     are exchanged. A rotation cannot mirror, so fx is negative.
     """
     model, data = renderer.model, renderer.data
-    spec, size_px = ALL_VIEWS[view], renderer.drawing.size_px
+    spec, size_px = ALL_VIEWS[view], renderer.model_renderer.size_px
     camera = model.camera(spec.camera).id
     focal_px = size_px / 2 / np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
     intrinsics = np.array([[-focal_px, 0.0, (size_px - 1) / 2], [0.0, focal_px, (size_px - 1) / 2], [0.0, 0.0, 1.0]])

@@ -142,7 +142,7 @@ def frames_of_steps(renderer: Renderer, trajectory: Trajectory, streams: Sequenc
     with renderer.perturbed(streams[0].changes):
         for step in range(len(trajectory.actions)):
             waiting.append((step, _start(renderer, trajectory.states[step], trajectory.site_alpha[step], streams)))
-            if len(waiting) > renderer.drawing.steps_ahead:
+            if len(waiting) > renderer.model_renderer.steps_ahead:
                 first_step, started = waiting.popleft()
                 yield _finished(started, streams, first_step)
         for last_step, started in waiting:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SIZE_PX
-from pipeline.rendering.drawing import PlainDrawing, Surfaces, texels
-from pipeline.rendering.savings import drawing_of
+from pipeline.rendering.plain_renderer import PlainRenderer, Surfaces, texels
+from pipeline.rendering.savings import create_model_renderer
 from pipeline.scenes.compiled import compile_model
 from pipeline.types import Frame, State
 
@@ -23,18 +23,20 @@ class Renderer:
 
     Args:
         scene: the scene's MJCF, or a compiled model, which then belongs to the renderer.
-        drawing: an open ``PlainDrawing`` of the model; by default it is created.
-        size_px: height and width of the frames; an open ``PlainDrawing`` has its own.
+        model_renderer: an open ``PlainRenderer`` of the model; by default it is created.
+        size_px: height and width of the frames; an open ``PlainRenderer`` has its own.
 
     Attributes:
         site_alpha: (nsite,) the sites' opacity in the first state.
     """
 
-    def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None, size_px: int = SIZE_PX):
+    def __init__(
+        self, scene: str | mujoco.MjModel, model_renderer: PlainRenderer | None = None, size_px: int = SIZE_PX
+    ):
         self.model = compile_model(scene) if isinstance(scene, str) else scene
         self.site_alpha = self.model.site_rgba[:, 3].copy()
         self.data = mujoco.MjData(self.model)
-        self.drawing = drawing or drawing_of(self.model, size_px)
+        self.model_renderer = model_renderer or create_model_renderer(self.model, size_px)
         self._perturbations: tuple[RenderPerturbation, ...] = ()
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
@@ -49,18 +51,18 @@ class Renderer:
 
     def frame(self, camera: str) -> Frame:
         """Render a frame (H, W, 3) of uint8 RGB of the restored state, oriented like LIBERO's raw observations."""
-        return self.drawing.frame(self.data, camera)
+        return self.model_renderer.frame(self.data, camera)
 
     def start_frame(self, camera: str) -> Callable[[], Frame]:
         """Start to render :meth:`frame` of the restored state, and return a function that waits for the frame.
 
         Another state may be restored meanwhile.
         """
-        return self.drawing.start_frame(self.data, camera)
+        return self.model_renderer.start_frame(self.data, camera)
 
     def surfaces(self, camera: str) -> Surfaces:
         """Render the depth, and the geom or site, of each pixel of :meth:`frame` in the restored state."""
-        return self.drawing.surfaces(self.data, camera)
+        return self.model_renderer.surfaces(self.data, camera)
 
     def geoms(self, camera: str) -> NDArray[np.int32]:
         """Return for each pixel of :meth:`frame`, (H, W), its geom's number in the model; -1 without a geom."""
@@ -89,7 +91,7 @@ class Renderer:
                 # All textures take up to 190 MB, and a perturbation changes few of them.
                 textures = self._replaced_textures(former["tex_data"])
                 del former["tex_data"]
-            self.drawing.load(textures.keys())
+            self.model_renderer.load(textures.keys())
             self._perturbations = tuple(perturbations)
             yield
         finally:
@@ -98,7 +100,7 @@ class Renderer:
                 getattr(self.model, name)[:] = values
             for texture, values in textures.items():
                 texels(self.model)[texture][:] = values
-            self.drawing.load(textures.keys())
+            self.model_renderer.load(textures.keys())
 
     def _replaced_textures(self, former: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
         """Return a copy of each texture of a former ``tex_data`` that differs from the model's texture now."""
@@ -106,18 +108,18 @@ class Renderer:
         return {number: before.copy() for number, (now, before) in enumerate(pairs) if not np.array_equal(now, before)}
 
     def close(self) -> None:
-        self.drawing.close()
+        self.model_renderer.close()
 
 
 class LastScene:
     """Holder of the open renderer; at most one renderer is open at a time.
 
     Repeated requests for a scene return its renderer. A request for another scene returns a new renderer. It takes over
-    the ``PlainDrawing`` and its OpenGL context if ``adopt`` accepts the scene.
+    the ``PlainRenderer`` and its OpenGL context if ``adopt`` accepts the scene.
     """
 
     def __init__(self) -> None:
-        self._drawing: PlainDrawing | None = None
+        self._model_renderer: PlainRenderer | None = None
         self._renderer: Renderer | None = None
         self._scene: str | mujoco.MjModel | None = None
 
@@ -136,14 +138,14 @@ class LastScene:
             ValueError: if MuJoCo rejects the scene or one of its images.
         """
         is_scene = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
-        has_size = self._drawing is not None and self._drawing.size_px == size_px
+        has_size = self._model_renderer is not None and self._model_renderer.size_px == size_px
         if self._renderer is not None and is_scene and has_size:
             return self._renderer
         try:
-            if self._drawing is not None and has_size and self._drawing.adopts:
+            if self._model_renderer is not None and has_size and self._model_renderer.adopts:
                 # A model takes 200 to 300 MB; the former model is freed before the next one is compiled.
                 self._renderer = self._scene = None
-                self._drawing.release()
+                self._model_renderer.release()
             else:
                 self.close()
             self._renderer = self._opened(compile_model(scene) if isinstance(scene, str) else copy.copy(scene), size_px)
@@ -156,21 +158,21 @@ class LastScene:
 
     def _opened(self, model: mujoco.MjModel, size_px: int) -> Renderer:
         """Open the renderer of a model in the context of the former model if possible, otherwise in a new context."""
-        if self._drawing is not None and self._drawing.adopt(model):
-            return Renderer(model, self._drawing)
+        if self._model_renderer is not None and self._model_renderer.adopt(model):
+            return Renderer(model, self._model_renderer)
         self.close()
         renderer = Renderer(model, size_px=size_px)
-        self._drawing = renderer.drawing
+        self._model_renderer = renderer.model_renderer
         # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
         atexit.register(self.close)
         return renderer
 
     def close(self) -> None:
         self._renderer = self._scene = None
-        if self._drawing is not None:
+        if self._model_renderer is not None:
             atexit.unregister(self.close)
-            self._drawing.close()
-            self._drawing = None
+            self._model_renderer.close()
+            self._model_renderer = None
 
 
 @functools.cache

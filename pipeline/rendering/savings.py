@@ -20,7 +20,7 @@ import numpy as np
 from pipeline import gl
 from pipeline.episode_schema import SIZE_PX
 from pipeline.errors import PipelineError
-from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.types import Frame
 
 PLAIN = "PLAIN_RENDERING"
@@ -72,33 +72,33 @@ SCENE = f"""
 </mujoco>"""
 
 
-def drawing_of(model: mujoco.MjModel, size_px: int = SIZE_PX) -> PlainDrawing:
-    """Create the ``PlainDrawing`` of a model, with savings if they can be used."""
+def create_model_renderer(model: mujoco.MjModel, size_px: int = SIZE_PX) -> PlainRenderer:
+    """Create the ``PlainRenderer`` of a model, with savings if they can be used."""
     if why_plain(size_px) is None:
         kind = kind_with_savings(gl.choose())
         if kind.possible(model):
             return kind(model, size_px)
         _say("a scene has height fields, skins, an unbounded floor, or another number than four samples a pixel")
-    return PlainDrawing(model, size_px)
+    return PlainRenderer(model, size_px)
 
 
-def kind_with_savings(choice: gl.GlChoice) -> type[PlainDrawing]:
-    """Return the kind of ``PlainDrawing`` that renders fastest on a device.
+def kind_with_savings(choice: gl.GlChoice) -> type[PlainRenderer]:
+    """Return the kind of ``PlainRenderer`` that renders fastest on a device.
 
     In software, rendering a face takes longer than the choice of faces, so all savings are used. A GPU that few
     processes use would wait for their choice of geoms, so all geoms are rendered, with frames in flight.
     """
     if choice.software:
-        from pipeline.rendering.software.drawing import SoftwareDrawing
+        from pipeline.rendering.software.software_renderer import SoftwareRenderer
 
-        return SoftwareDrawing
+        return SoftwareRenderer
     if choice.sharing < SHARING:
-        from pipeline.rendering.software.in_flight import InFlightDrawing
+        from pipeline.rendering.software.in_flight import InFlightRenderer
 
-        return InFlightDrawing
-    from pipeline.rendering.software.layers import LayersDrawing
+        return InFlightRenderer
+    from pipeline.rendering.software.layers import LayeredRenderer
 
-    return LayersDrawing
+    return LayeredRenderer
 
 
 @functools.cache
@@ -131,10 +131,10 @@ def _say(reason: str) -> None:
     logging.getLogger(__name__).warning("rendering optimizations are disabled: %s", reason)
 
 
-def fault(kind: type[PlainDrawing], size_px: int = SIZE_PX) -> str | None:
+def fault(kind: type[PlainRenderer], size_px: int = SIZE_PX) -> str | None:
     """Return the error or the difference that savings of a kind cause here; ``None`` if all pixels are equal."""
     try:
-        plain, saving = frames(PlainDrawing, size_px), frames(kind, size_px)
+        plain, saving = frames(PlainRenderer, size_px), frames(kind, size_px)
     except PipelineError as error:
         return f"OpenGL rejects a command of the savings: {error.what}"
     frame_pairs = zip(plain, saving, strict=True)
@@ -142,16 +142,16 @@ def fault(kind: type[PlainDrawing], size_px: int = SIZE_PX) -> str | None:
     return f"{differing} of {len(plain)} frames of a small scene have other pixels" if differing else None
 
 
-def frames(kind: type[PlainDrawing], size_px: int = SIZE_PX) -> list[Frame]:
-    """Render the small scene in all states by one kind of ``PlainDrawing``."""
+def frames(kind: type[PlainRenderer], size_px: int = SIZE_PX) -> list[Frame]:
+    """Render the small scene in all states by one kind of ``PlainRenderer``."""
     model = mujoco.MjModel.from_xml_string(SCENE)
     data, started = mujoco.MjData(model), []
-    with closing(kind(model, size_px)) as drawing:
+    with closing(kind(model, size_px)) as renderer:
         for shadows in (0, 1):
             model.light_castshadow[1] = shadows
             for state in range(STATES):
                 data.mocap_pos[0, 1] = 0.1 * state
                 data.mocap_quat[0] = np.cos(state), np.sin(state), 0, 0
                 mujoco.mj_forward(model, data)
-                started.append(drawing.start_frame(data, "eye"))
+                started.append(renderer.start_frame(data, "eye"))
         return [wait() for wait in started]

@@ -62,7 +62,7 @@ class Sight:
         seen = renderer.geoms(CAMERA)
         bodies = model.geom_bodyid[seen[seen >= 0]]
         pixels = np.bincount(model.body_rootid[bodies], minlength=model.nbody)
-        trees = np.rint(pixels * (SIZE_PX / renderer.drawing.size_px) ** 2).astype(int)
+        trees = np.rint(pixels * (SIZE_PX / renderer.model_renderer.size_px) ** 2).astype(int)
         camera = model.camera(CAMERA).id
         things = definition_of(task).things_of_interest
         # A camera looks along its -z axis.

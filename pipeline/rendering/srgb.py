@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rendering.drawing import texels
+from pipeline.rendering.plain_renderer import texels
 from pipeline.rendering.renderer import Renderer
 
 FIRST_VERSION = "3.3.3"
@@ -31,12 +31,12 @@ def decoded(renderer: Renderer) -> Iterator[None]:
     try:
         for number in textures:
             views[number][:] = _LINEAR[views[number]]
-        renderer.drawing.load(textures)
+        renderer.model_renderer.load(textures)
         yield
     finally:
         for number, values in former.items():
             views[number][:] = values
-        renderer.drawing.load(textures)
+        renderer.model_renderer.load(textures)
 
 
 def _linear() -> NDArray[np.uint8]:

@@ -56,7 +56,7 @@ def _policy_findings(policy: Evaluated, sources: Sequence[str]) -> dict[str, Any
     return {
         "settings": policy.settings,
         "versions": versions_of(policy.rows),
-        "refused": policy.refused,
+        "refused": policy.rejected,
         "overall": overall,
         "results": results,
     }

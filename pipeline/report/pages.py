@@ -62,7 +62,7 @@ def picture(image: Image.Image) -> str:
     return _address("image/jpeg", packed.getvalue())
 
 
-def beside(twin: Sequence[Jpeg], episode: Sequence[Jpeg]) -> Clip:
+def show_side_by_side(twin: Sequence[Jpeg], episode: Sequence[Jpeg]) -> Clip:
     """Show two episodes' stored frames side by side, in real time; the shorter episode stays at its last frame."""
     frames: list[Frame] = []
     left = right = decode(twin[0])

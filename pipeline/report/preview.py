@@ -47,7 +47,7 @@ CANDIDATES = 200
 
 SIDE_PX = {1: 256, 2: 192, 3: 144, 4: 128, 5: 112, 6: 96}
 """Width of a frame, by the number of views of a tile."""
-REFUSED_GREY = (160, 160, 160)
+REJECTED_GREY = (160, 160, 160)
 
 
 @dataclass
@@ -195,8 +195,8 @@ def combinations(
             what = f"the axis {axis_name} cannot change the task {demo.task}"
             raise PipelineError(what, remedy="choose another task or another axis")
         axis.reject_levels_without_clearance(test, demo.task)
-    draws = Sampler(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
-    left = list(islice(draws, CANDIDATES))
+    samples = Sampler(name, axes, seed, test).sample(demo.demo_id, demo.task, expanded_by=demo.perturbations)
+    left = list(islice(samples, CANDIDATES))
     chosen: list[tuple[Perturbation, ...]] = []
     count = PHYSICS_VARIANTS if left and of_layer(left[0], PhysicsPerturbation) else VARIANTS
 
@@ -227,23 +227,23 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
         test: the benchmark's test tasks, to which the plan's perturbations keep a clearance.
     """
     demo, seed = stage.demo, config.plan.seed
-    drawn = combinations(name, axes_for(name, config), demo, seed, test)
+    sampled = combinations(name, axes_for(name, config), demo, seed, test)
     changed: set[str] = set()
-    for perturbations in drawn:
+    for perturbations in sampled:
         changed.update(*(p.views for p in perturbations))
     changed = changed or {"image"}
     views = [view for view in config.render.content.views if view in changed]
     side = SIDE_PX[len(views)]
     original = stage.frames(views)
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
-    if not drawn:
-        tiles.append(_nothing_drawn(name, tiles[0].picture.size))
+    if not sampled:
+        tiles.append(_no_perturbation_tile(name, tiles[0].picture.size))
     strips: list[Tile] = []
-    for perturbations in drawn:
+    for perturbations in sampled:
         strips += _strip(stage, perturbations)
     if strips:
-        tiles, drawn, views = strips, [], ["image"]
-    for perturbations in drawn:
+        tiles, sampled, views = strips, [], ["image"]
+    for perturbations in sampled:
         caption = "; ".join(map(describe, perturbations))
         try:
             # A perturbation of the instruction alone changes no frame.
@@ -285,13 +285,13 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
         axis = configured(name, config)
         without_rewrites = isinstance(axis, LanguageAxis) and not axis.list_clear_rewrites(demo.task, test)
         if axis.applies(demo.task) and not without_rewrites:
-            drawn = variants(name, axis, demo, config.plan.seed, test)
-            tiles.append(_typical(stage, drawn) if drawn else _nothing_drawn(name))
+            sampled = variants(name, axis, demo, config.plan.seed, test)
+            tiles.append(_typical(stage, sampled) if sampled else _no_perturbation_tile(name))
     return sheet(f"{demo.task}: first frame of the agent view, one perturbation of each axis", tiles, 5)
 
 
-def _typical(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
-    for perturbation in sorted(drawn, key=lambda p: (abs(p.level - SHOWN_LEVEL), -p.level)):
+def _typical(stage: Stage, sampled: Sequence[Perturbation]) -> Tile:
+    for perturbation in sorted(sampled, key=lambda p: (abs(p.level - SHOWN_LEVEL), -p.level)):
         caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
         try:
             (frame,) = stage.frames(["image"], perturbation)
@@ -304,13 +304,13 @@ def _typical(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
     return _rejected_tile(*last)
 
 
-def _nothing_drawn(name: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
+def _no_perturbation_tile(name: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
     caption = f"no perturbation of {name} keeps its clearance to the test set in this task"
-    return Tile(Image.new("RGB", size_px, REFUSED_GREY), caption)
+    return Tile(Image.new("RGB", size_px, REJECTED_GREY), caption)
 
 
 def _rejected_tile(why: RejectedError, caption: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
-    return Tile(Image.new("RGB", size_px, REFUSED_GREY), f"rejected, {why.reason}: {caption}")
+    return Tile(Image.new("RGB", size_px, REJECTED_GREY), f"rejected, {why.reason}: {caption}")
 
 
 def for_run(config: Config, folder: Path, workers: Workers) -> None:
@@ -323,12 +323,12 @@ def for_run(config: Config, folder: Path, workers: Workers) -> None:
     with replaced(folder) as temporary:
         jobs = [(tasks, config, temporary / suite, test) for suite, tasks in by_suite.items()]
         try:
-            workers(_draw_all, jobs, "previews")
+            workers(_render_all, jobs, "previews")
         finally:
             scene_of_process().close()
 
 
-def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
+def _render_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     tasks, config, folder, test = job
     # The folder exists if another worker was lost while it rendered these sheets.
     folder.mkdir(parents=True, exist_ok=True)

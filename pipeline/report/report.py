@@ -183,11 +183,11 @@ def _worst(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
     plots_and_tables = {}
-    drawn_on: dict[str, list[tuple[Mapping[str, Any], Perturbation]]] = {}
+    perturbed_on: dict[str, list[tuple[Mapping[str, Any], Perturbation]]] = {}
     for row in tried:
         for made in from_json(row["perturbations"]):
-            drawn_on.setdefault(made.axis, []).append((row, made))
-    for axis, of_axis in drawn_on.items():
+            perturbed_on.setdefault(made.axis, []).append((row, made))
+    for axis, of_axis in perturbed_on.items():
         table = yields.by_level("Kept/planned episodes, by component", [row for row, _ in of_axis], axis)
         kept = []
         for row, made in of_axis:
@@ -233,7 +233,9 @@ def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
 
 def _video(row: Mapping[str, Any], load: EpisodeLoader, caption: str) -> Video:
     twin, episode = load(row["twin_id"]), load(row["episode_id"])
-    return Video(row["axis"], caption, row["instruction"], pages.beside(twin.frames["image"], episode.frames["image"]))
+    return Video(
+        row["axis"], caption, row["instruction"], pages.show_side_by_side(twin.frames["image"], episode.frames["image"])
+    )
 
 
 def _agent_view(row: Mapping[str, Any]) -> tuple[object, str]:

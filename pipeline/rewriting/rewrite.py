@@ -69,17 +69,17 @@ def _sentence(fact: Fact) -> str:
     return f"{fact[0]}({', '.join(map(_words, fact[1:]))})"
 
 
-def prompt(told: Mapping[str, Any], component: Component, count: int, have: list[str], refused: Counter[str]) -> str:
+def prompt(told: Mapping[str, Any], component: Component, count: int, have: list[str], rejected: Counter[str]) -> str:
     """Write the question for ``count`` more rewrites of one class.
 
     Args:
         told: result of ``brief``.
         have: rewrites that the model must not repeat.
-        refused: reasons for the rejection of earlier rewrites; the five most common ones enter the question.
+        rejected: reasons for the rejection of earlier rewrites; the five most common ones enter the question.
     """
     template = Path(__file__).with_name("prompt.txt.j2").read_text()
-    reasons = [reason for reason, _ in refused.most_common(5)]
-    fields = {**told, "component": component, "count": count, "have": have, "refused": reasons, "length": LENGTH}
+    reasons = [reason for reason, _ in rejected.most_common(5)]
+    fields = {**told, "component": component, "count": count, "have": have, "rejected": reasons, "length": LENGTH}
     question: str = Template(template, undefined=StrictUndefined, trim_blocks=True).render(fields)
     return question
 
@@ -105,19 +105,19 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     taken: set[str] = set()
     for texts in (*stored.values(), *shipped.values()):
         taken |= {normalise(text) for text in texts}
-    refused: Counter[str] = Counter()
+    rejected: Counter[str] = Counter()
     for component in CLASSES:
         idle = 0
         while len(stored[component]) < per_class and idle < IDLE_ANSWERS:
             missing = per_class - len(stored[component])
             have = [*shipped.get(component, ()), *stored[component]]
-            question = prompt(task_brief, component, min(missing, ASKED_AT_ONCE), have, refused)
+            question = prompt(task_brief, component, min(missing, ASKED_AT_ONCE), have, rejected)
             try:
                 accepted, reasons = _sift(listed(ask(question)), task, component, taken, missing)
             except UnusableError as error:
                 accepted, reasons = [], Counter([str(error)])
             idle = 0 if accepted else idle + 1
-            refused += reasons
+            rejected += reasons
             if accepted:
                 stored[component] += tuple(accepted)
                 _add(accepted, component, task, out)
@@ -125,7 +125,7 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     if any(len(stored[component]) < per_class for component in CLASSES):
         counts = ", ".join(f"{component} {len(stored[component])}" for component in CLASSES)
         raise PipelineError(
-            f"the model gave too few acceptable rewrites of {task}: {counts}{_because(refused)}",
+            f"the model gave too few acceptable rewrites of {task}: {counts}{_because(rejected)}",
             where=out,
             expected=f"{per_class} of each class",
             remedy="run the command again, which resumes from the accepted rewrites; or ask another model",

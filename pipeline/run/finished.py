@@ -182,12 +182,12 @@ def host() -> list[list[str]]:
 def summary_memory(run: Run) -> Memory:
     """Return the memory of the contact sheets and previews."""
     names = (PLAN, MANIFEST, INPUTS, FRAMES_TABLE)
-    return _pictures_memory(run, "summary", [SHEETS, PREVIEWS], _drawn_by(run.config), names)
+    return _pictures_memory(run, "summary", [SHEETS, PREVIEWS], _settings_of_pictures(run.config), names)
 
 
 def previews_memory(run: Run) -> Memory:
     """Return the memory of the previews, which show no episode and do not depend on kept or exported episodes."""
-    return _pictures_memory(run, "previews", [PREVIEWS], _drawn_by(run.config), [INPUTS])
+    return _pictures_memory(run, "previews", [PREVIEWS], _settings_of_pictures(run.config), [INPUTS])
 
 
 def report_memory(run: Run) -> Memory:
@@ -223,7 +223,7 @@ def _memory(
     return Memory(run.folder, stage, Basis.of(requested, made_with(step)), outputs)
 
 
-def _drawn_by(config: Config) -> dict[str, object]:
+def _settings_of_pictures(config: Config) -> dict[str, object]:
     return {
         "demos": settings_of(config.demos),
         "plan": settings_of(config.plan),

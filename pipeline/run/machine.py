@@ -64,7 +64,7 @@ def trial() -> Trial:
     """Simulate ten control steps and render a frame, in about five seconds."""
     from pipeline.physics.environment import Environment
     from pipeline.physics.replay import replay
-    from pipeline.rendering.drawing import PlainDrawing
+    from pipeline.rendering.plain_renderer import PlainRenderer
     from pipeline.rendering.renderer import Renderer
 
     demo = StarterSource().demonstration(find_task(*TRIAL_TASK))
@@ -77,7 +77,7 @@ def trial() -> Trial:
     renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
     frame = renderer.frame("agentview")
     renderer.close()
-    plain = Renderer(renderer.model, PlainDrawing(renderer.model))
+    plain = Renderer(renderer.model, PlainRenderer(renderer.model))
     plain.restore(trajectory.states[-1], trajectory.site_alpha[-1])
     gpus = 0 if gl.choose().software else max(1, len(gl.gpus()))
     frame_s = _seconds(lambda: plain.frame("agentview"), gpus > 0)

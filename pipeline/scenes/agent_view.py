@@ -8,7 +8,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.types import Floats
 
 _HALF_PX = SCHEMA.frame.shape[0] / 2
-_DRAWN = np.array([0, 1, 0, 0, 0, 0], np.uint8)
+_RENDERED = np.array([0, 1, 0, 0, 0, 0], np.uint8)
 """Flags of the geom groups that are rendered; collision geometry is not rendered."""
 
 Pixels = NDArray[np.intp]
@@ -33,7 +33,7 @@ class AgentView:
         hit, length = np.full(count, -1, np.int32), np.zeros(count)
         if count:
             eye_m = camera.xpos.copy()
-            mujoco.mj_multiRay(self._model, self._data, eye_m, rays.ravel(), _DRAWN, 1, -1, hit, length, count, 1e3)
+            mujoco.mj_multiRay(self._model, self._data, eye_m, rays.ravel(), _RENDERED, 1, -1, hit, length, count, 1e3)
         roots = self._model.body_rootid[self._model.geom_bodyid[hit]]
         return np.where(hit >= 0, roots, -1).astype(np.intp)
 

@@ -137,7 +137,7 @@ class _FileJob:
         reasons = self._replayed(chosen, self.replay)
         missing = [entry for entry, reason in reasons.items() if reason in FAILURE_REASONS]
         all_miss = len(missing) == len(chosen) > 0
-        faults += [self._not_replayed(entry, reasons[entry]) for entry in chosen if _is_refused(reasons[entry])]
+        faults += [self._not_replayed(entry, reasons[entry]) for entry in chosen if _is_rejected(reasons[entry])]
         if all_miss:
             faults += self._missing(missing, reasons)
         reached = [entry for entry, reason in reasons.items() if reason == "kept"]
@@ -237,7 +237,7 @@ class _FileJob:
         return (), CheckedDemos(faults=[f"{self._file}: {LOST}, so no worker reads the file"])
 
 
-def _is_refused(reason: str) -> bool:
+def _is_rejected(reason: str) -> bool:
     """Return whether a demonstration has no verdict on its goal."""
     return reason != "kept" and reason not in FAILURE_REASONS
 

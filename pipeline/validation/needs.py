@@ -111,10 +111,10 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     amounts = Amounts.of(tasks, config.plan)
     # Time to render a frame of each view: the mean over all demonstrations.
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
-    drawn_s = np.average([ARENAS[arena].frame_s for arena in arenas], axis=0, weights=weights)
+    mean_frame_s = np.average([ARENAS[arena].frame_s for arena in arenas], axis=0, weights=weights)
     slower = speed.frame_s / REFERENCE.frame_s
     content = config.render.content
-    agent_s, wrist_s = (float(s) * slower for s in drawn_s)
+    agent_s, wrist_s = (float(s) * slower for s in mean_frame_s)
     # A further view takes about as long as the agent view.
     frame_s = [agent_s, wrist_s, *[agent_s] * (len(content.views) - 2)]
     if speed.gpus:

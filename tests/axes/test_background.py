@@ -25,7 +25,7 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 
 
-def drawn(component: Component, level: Level, key: str | int) -> BackgroundPerturbation:
+def sample(component: Component, level: Level, key: str | int) -> BackgroundPerturbation:
     axis = BackgroundAxis(components=(component,), levels=(level,), sources=("procedural",))
     return axis.sample(rng("background", component, level, key), MILK, 0)
 
@@ -63,7 +63,7 @@ def test_only_the_named_surfaces_change_and_all_comes_back(shown: Renderer, requ
     arena = request.node.callspec.params["shown"]
     before, clean, textures = checksums(shown), frames(shown), texture_bytes(shown)
     for component in PARTS:
-        perturbation = drawn(component, 5, arena)
+        perturbation = sample(component, 5, arena)
         with shown.perturbed([perturbation]):
             assert changed(before, checksums(shown)) == {"tex_data"}
             replaced = {shown.model.texture(i).name for i, now in enumerate(texture_bytes(shown)) if now != textures[i]}
@@ -89,7 +89,7 @@ def test_levels_move_the_average_colour_away(shown: Renderer) -> None:
     for scale in (0.2, 1.0):
         after = []
         for key in range(5):
-            perturbation = drawn("surface", 1, key).model_copy(update={"colour_scale": scale})
+            perturbation = sample("surface", 1, key).model_copy(update={"colour_scale": scale})
             with shown.perturbed([perturbation]):
                 after.append(change(clean, frames(shown, ["agentview"])["agentview"]))
         changes.append(mean(after))
@@ -102,7 +102,7 @@ def test_levels_move_the_average_colour_away(shown: Renderer) -> None:
         fields = ("tex_data", "light_diffuse")
 
         def apply(self, model: object) -> None:
-            drawn("surface", 5, 0).apply(model)
+            sample("surface", 5, 0).apply(model)
             raise RuntimeError
 
     before = checksums(shown)
@@ -112,17 +112,17 @@ def test_levels_move_the_average_colour_away(shown: Renderer) -> None:
     assert np.array_equal(frames(shown, ["agentview"])["agentview"], clean)
 
 
-def test_draws_are_keyed_recorded_and_from_all_sources() -> None:
-    draws = [BackgroundAxis().sample(rng("draw", key), MILK, 0) for key in range(400)]
-    assert draws == [BackgroundAxis().sample(rng("draw", key), MILK, 3) for key in range(400)]
-    for one in draws:
+def test_perturbations_depend_on_their_key_read_back_and_use_all_sources() -> None:
+    perturbations = [BackgroundAxis().sample(rng("draw", key), MILK, 0) for key in range(400)]
+    assert perturbations == [BackgroundAxis().sample(rng("draw", key), MILK, 3) for key in range(400)]
+    for one in perturbations:
         assert BackgroundPerturbation.model_validate_json(one.model_dump_json()) == one
         assert [covering.part for covering in one.coverings] == list(PARTS[one.component])
-    names = [c.texture for one in draws for c in one.coverings if family(c) not in DATA_MAPS]
+    names = [c.texture for one in perturbations for c in one.coverings if family(c) not in DATA_MAPS]
     assert {name.partition(":")[0] for name in names} == {"libero", "robosuite", "procedural"}
     assert 0.2 < mean(not name.startswith("procedural:") for name in names) < 0.4
-    assert {one.level for one in draws} == {1, 2, 3, 4, 5}
-    assert {covering.quarter_turns for one in draws for covering in one.coverings} == {0, 1, 2, 3}
+    assert {one.level for one in perturbations} == {1, 2, 3, 4, 5}
+    assert {covering.quarter_turns for one in perturbations for covering in one.coverings} == {0, 1, 2, 3}
 
 
 def family(covering: Covering) -> str:
@@ -138,15 +138,15 @@ def test_own_colours_are_level_5() -> None:
     assert {weak.sample(rng("own", key), MILK, 0).colour_scale for key in range(100)} == {0.2, 0.4}
 
 
-def test_half_of_the_draws_have_their_own_colours_and_show_every_kind_of_map() -> None:
+def test_half_of_the_perturbations_have_their_own_colours_and_show_every_kind_of_map() -> None:
     """A colour scale of 0.9 at level 5 tells the others of this level from those in own colours."""
     axis = BackgroundAxis(colour_scale=(0.2, 0.4, 0.6, 0.8, 0.9))
-    draws = [axis.sample(rng("own", key), MILK, 0) for key in range(600)]
-    own = [one for one in draws if one.colour_scale == 1]
-    assert 0.45 < len(own) / len(draws) < 0.55
+    perturbations = [axis.sample(rng("own", key), MILK, 0) for key in range(600)]
+    own = [one for one in perturbations if one.colour_scale == 1]
+    assert 0.45 < len(own) / len(perturbations) < 0.55
     worked_on = [family(one.coverings[-1]) for one in own]
     assert 0.63 < mean(name in DATA_MAPS for name in worked_on) < 0.77
-    elsewhere = [c for one in draws for c in one.coverings if c.part != "surface" or one not in own]
+    elsewhere = [c for one in perturbations for c in one.coverings if c.part != "surface" or one not in own]
     assert not any(family(covering) in DATA_MAPS for covering in elsewhere), "a map in another image's colours"
     for component in PARTS:
         shown = {family(one.coverings[-1]) for one in own if one.component == component}
@@ -154,7 +154,7 @@ def test_half_of_the_draws_have_their_own_colours_and_show_every_kind_of_map() -
 
 
 def test_what_is_in_its_own_colours_is_the_image_as_it_is() -> None:
-    """A normal map in MuJoCo's texture, beside the same image that OpenCV makes as large."""
+    """A normal map in MuJoCo's texture, next to the same image that OpenCV makes as large."""
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><asset><texture name="t" type="2d" builtin="flat" rgb1="0.9 0.1 0.1" width="512" height="512"/>
         <material name="table_texture" texture="t"/></asset>
@@ -236,7 +236,7 @@ def test_nearest_knows_test_images_by_name_and_by_content() -> None:
 
 
 @pytest.mark.slow
-def test_draws_are_clear_of_the_benchmark() -> None:
+def test_perturbations_keep_their_clearance_from_the_benchmark() -> None:
     test = benchmark.load(REPOSITORY / benchmark.FOLDER)
     shown = {other.parameters[part] for other in test.on_axis("background") for part in ("surface", "wall")
              if part in other.parameters}  # fmt: skip
@@ -252,4 +252,4 @@ def test_draws_are_clear_of_the_benchmark() -> None:
 def test_what_cannot_be_covered_is_an_error() -> None:
     bare = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     with pytest.raises(PipelineError, match="shows no surface"):
-        drawn("surface", 1, 0).apply(bare)
+        sample("surface", 1, 0).apply(bare)

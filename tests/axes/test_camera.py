@@ -113,20 +113,20 @@ def test_directions_mean_what_the_docstrings_say() -> None:
     assert looks(pitched)[2] < looks(TABLETOP_QUAT_WXYZ)[2]
 
 
-def draws(axis: CameraAxis, count: int = 1000, task: Task = MILK) -> list[CameraPerturbation]:
+def sample_many(axis: CameraAxis, count: int = 1000, task: Task = MILK) -> list[CameraPerturbation]:
     return [axis.sample(rng(1, "camera", "demo", variant), task, variant) for variant in range(count)]
 
 
-def test_draws_are_keyed_and_cover_every_component_and_level() -> None:
-    drawn = draws(CameraAxis())
-    assert drawn == draws(CameraAxis())
-    assert from_json(to_json(drawn[:1])) == (drawn[0],)
-    assert {(p.component, p.level) for p in drawn} == set(itertools.product(COMPONENTS, range(1, 6)))
+def test_perturbations_depend_on_their_key_and_cover_every_component_and_level() -> None:
+    perturbations = sample_many(CameraAxis())
+    assert perturbations == sample_many(CameraAxis())
+    assert from_json(to_json(perturbations[:1])) == (perturbations[0],)
+    assert {(p.component, p.level) for p in perturbations} == set(itertools.product(COMPONENTS, range(1, 6)))
 
 
 def test_the_level_is_the_strength_of_what_the_component_is_about() -> None:
     axis = CameraAxis()
-    for p in draws(axis):
+    for p in sample_many(axis):
         by_level, strength = {
             "distance": (axis.distance.distance_scale, p.distance_scale),
             "spherical": (axis.spherical.azimuth_deg, p.azimuth_deg),
@@ -135,14 +135,14 @@ def test_the_level_is_the_strength_of_what_the_component_is_about() -> None:
         assert any(low <= strength <= high for low, high in by_level[p.level - 1]), p
 
 
-def test_beside_its_component_a_draw_changes_one_thing_a_little() -> None:
-    for p in draws(CameraAxis()):
+def test_a_perturbation_changes_one_thing_a_little_in_addition_to_its_component() -> None:
+    for p in sample_many(CameraAxis()):
         aside = {
             "elevation": p.component != "spherical" and p.elevation_deg != 0,
             "distance": p.component != "distance" and p.distance_scale != 1,
             "turn": p.component != "orientation" and (p.yaw_deg, p.pitch_deg) != (0, 0),
         }
-        # Of a spherical draw the elevation itself may be what is off the test set's.
+        # Of a spherical perturbation the elevation itself may be what is off the test set's.
         assert sum(aside.values()) == 1 or (p.component == "spherical" and not any(aside.values())), p
         assert p.component == "spherical" or p.azimuth_deg == 0
         assert p.component == "distance" or p.distance_scale == 1 or 1.094 <= p.distance_scale <= 1.18
@@ -151,17 +151,17 @@ def test_beside_its_component_a_draw_changes_one_thing_a_little() -> None:
 
 
 def test_no_side_is_preferred() -> None:
-    drawn = draws(CameraAxis())
+    perturbations = sample_many(CameraAxis())
     for component, name in itertools.product(COMPONENTS, ("azimuth_deg", "yaw_deg", "pitch_deg")):
-        turns = [getattr(p, name) for p in drawn if p.component == component and getattr(p, name)]
+        turns = [getattr(p, name) for p in perturbations if p.component == component and getattr(p, name)]
         assert abs(np.mean(np.sign(turns or [-1, 1]))) < 0.3, (component, name)
-    diagonal = [np.sign(p.yaw_deg * p.pitch_deg) for p in drawn if p.component == "orientation"]
+    diagonal = [np.sign(p.yaw_deg * p.pitch_deg) for p in perturbations if p.component == "orientation"]
     assert abs(np.mean(diagonal)) < 0.2
 
 
 def test_levels_and_components_can_be_chosen() -> None:
     axis = CameraAxis(levels=(2, 5), components=("spherical",))
-    assert {(p.component, p.level) for p in draws(axis, 50)} == {("spherical", 2), ("spherical", 5)}
+    assert {(p.component, p.level) for p in sample_many(axis, 50)} == {("spherical", 2), ("spherical", 5)}
     with pytest.raises(ValidationError, match="components"):
         CameraAxis(components=())
 
@@ -181,7 +181,7 @@ def test_no_configured_range_is_left(task: Task, clear_by: str) -> None:
     spherical = {"elevation_deg": [[0, 5]], "azimuth_deg": [[[-10, 10]]] * 5}
     settings = {"components": ["spherical"], "spherical": spherical, "clear_by": clear_by}
     axis = CameraAxis.model_validate(settings)
-    for p in draws(axis, task=task):
+    for p in sample_many(axis, task=task):
         assert 0 <= p.elevation_deg <= 5
         assert abs(p.azimuth_deg) <= 10
         assert (p.distance_scale, p.yaw_deg, p.pitch_deg) == (1, 0, 0)
@@ -193,18 +193,18 @@ def test_a_second_change_is_within_the_ranges_of_its_component() -> None:
         "spherical": {"elevation_deg": [[2, 6]]},
         "orientation": {"turn_deg": [[[0, 6]]] * 5},
     }
-    drawn = draws(CameraAxis.model_validate(settings))
-    for p in drawn:
+    perturbations = sample_many(CameraAxis.model_validate(settings))
+    for p in perturbations:
         assert 1 <= p.distance_scale <= 1.1
         assert 2 <= p.elevation_deg <= 6 or (p.component != "spherical" and p.elevation_deg == 0)
         assert 0 <= max(p.yaw_deg, p.pitch_deg, key=abs) <= 6
-    changed = Counter((p.component, p.distance_scale != 1, bool(p.yaw_deg)) for p in drawn)
+    changed = Counter((p.component, p.distance_scale != 1, bool(p.yaw_deg)) for p in perturbations)
     assert changed["spherical", True, False] > 50
     assert changed["spherical", False, True] > 50
 
 
 def test_only_tasks_of_tested_suites_get_a_second_change(test_set: TestSet) -> None:
-    for p in draws(CameraAxis(), task=OF_LIBERO_90):
+    for p in sample_many(CameraAxis(), task=OF_LIBERO_90):
         parts = (p.azimuth_deg or p.elevation_deg, p.distance_scale - 1, p.yaw_deg or p.pitch_deg)
         assert sum(part != 0 for part in parts) == 1, p
         assert p.nearest(test_set, OF_LIBERO_90) == (np.inf, 0)
@@ -228,7 +228,7 @@ def test_a_task_of_libero_90_in_a_tested_scene_keeps_its_clearance(test_set: Tes
         parameters = {name: planted.parameters[name] for name in PARAMETERS}
         same = CameraPerturbation.model_validate({"component": planted.component, "level": 1, **parameters})
         assert same.nearest(test_set, task).distance == pytest.approx(0, abs=1e-5)
-        found = [p.nearest(test_set, task).distance for p in draws(CameraAxis(), task=task)[:20]]
+        found = [p.nearest(test_set, task).distance for p in sample_many(CameraAxis(), task=task)[:20]]
         assert np.mean(np.array(found) >= CameraPerturbation.clearance) > 0.7
 
 
@@ -243,19 +243,19 @@ def test_ranges_without_a_clear_camera_are_rejected(test_set: TestSet) -> None:
     CameraAxis.model_validate(low).reject_levels_without_clearance(test_set, MILK)
 
 
-def test_default_draws_are_mostly_clear_of_every_test_camera(test_set: TestSet) -> None:
-    found = [p.nearest(test_set, MILK) for p in draws(CameraAxis())]
+def test_default_cameras_mostly_keep_their_clearance_from_every_test_camera(test_set: TestSet) -> None:
+    found = [p.nearest(test_set, MILK) for p in sample_many(CameraAxis())]
     assert {near.compared for near in found} == {len(test_set.tasks)}
-    # The rest is drawn anew.
+    # The rest is sampled again.
     assert np.mean([near.distance >= CameraPerturbation.clearance for near in found]) > 0.9
 
 
 @pytest.mark.parametrize("steepest_deg", [60.5, -9.5], ids=["steepest arena", "flattest arena"])
-def test_clear_draws_cover_the_test_cameras(
+def test_cameras_with_clearance_cover_the_test_cameras(
     steepest_deg: float, test_set: TestSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the measure, which is that of the steepest arena, and where a degree of azimuth is farther."""
-    clear = [p for p in draws(CameraAxis(), 4000) if p.nearest(test_set, MILK).distance >= p.clearance]
+    clear = [p for p in sample_many(CameraAxis(), 4000) if p.nearest(test_set, MILK).distance >= p.clearance]
     monkeypatch.setattr("pipeline.axes.camera.STEEPEST_DEG", steepest_deg)
     same = TestSet(test_set.tasks)  # what is remembered of a test set is of another arena
     covered = leakage.coverage("camera", leakage.distances("camera", [(p, MILK) for p in clear], same), same)
@@ -307,7 +307,9 @@ def test_distance_is_a_bound_on_the_angle_between_rays_in_every_arena() -> None:
         (camera("orientation", yaw_deg=6.5, pitch_deg=-9), camera("orientation", pitch_deg=-15.2)),
     ],
 )
-def test_where_the_line_is_drawn(near: CameraPerturbation, clear: CameraPerturbation, test_set: TestSet) -> None:
+def test_cameras_at_the_limit_of_the_clearance(
+    near: CameraPerturbation, clear: CameraPerturbation, test_set: TestSet
+) -> None:
     assert near.nearest(test_set, MILK).distance < CameraPerturbation.clearance
     assert clear.nearest(test_set, MILK).distance >= CameraPerturbation.clearance
 
@@ -326,9 +328,9 @@ def test_order_of_listing_does_not_matter() -> None:
 def test_no_camera_rolls_more_than_the_test_s() -> None:
     """The horizontal axis of a picture stays level: the test cameras tilt it by at most 1.7 degrees."""
     tilts_deg = {"test": 0.0, "ours": 0.0}
-    drawn = [CameraAxis().sample(rng("roll", key), MILK, 0) for key in range(600)]
+    perturbations = [CameraAxis().sample(rng("roll", key), MILK, 0) for key in range(600)]
     grid = [camera(component, **parameters) for component, parameters in benchmark_cameras()]
-    for source, cameras in (("test", grid), ("ours", drawn)):
+    for source, cameras in (("test", grid), ("ours", perturbations)):
         for one in cameras:
             _, quat_wxyz = one.pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
             right = Rotation.from_quat(quat_wxyz, scalar_first=True).apply([1.0, 0.0, 0.0])

@@ -33,7 +33,7 @@ DEMO = starter_demo(BOWL)
 SCENE = recorded_start(DEMO, "")
 
 
-def draws(axis: DisturbanceAxis, count: int) -> list[DisturbancePerturbation]:
+def sample_many(axis: DisturbanceAxis, count: int) -> list[DisturbancePerturbation]:
     return [axis.sample(rng(1, "disturbance", variant), BOWL, variant) for variant in range(count)]
 
 
@@ -51,21 +51,21 @@ def pushed_at(first_step: int, force_n: float = 50.0, away_steps: int = 5) -> Di
     )
 
 
-def test_draws_are_keyed_and_as_strong_as_their_level_says() -> None:
-    drawn = draws(DisturbanceAxis(), 500)
-    assert drawn == draws(DisturbanceAxis(), 500)
-    assert {one.level for one in drawn} == {1, 2, 3, 4, 5}
-    assert {one.steps for one in drawn} == {2, 3, 4, 5, 6, 7, 8}
-    for one in drawn:
+def test_perturbations_depend_on_their_key_and_are_as_strong_as_their_level() -> None:
+    perturbations = sample_many(DisturbanceAxis(), 500)
+    assert perturbations == sample_many(DisturbanceAxis(), 500)
+    assert {one.level for one in perturbations} == {1, 2, 3, 4, 5}
+    assert {one.steps for one in perturbations} == {2, 3, 4, 5, 6, 7, 8}
+    for one in perturbations:
         assert np.linalg.norm(one.wrench[:3]) * one.steps * 0.05 == pytest.approx(1 + 3 * one.level, abs=1e-3)
         assert abs(one.wrench[2]) <= np.linalg.norm(one.wrench[:3]) / 2 + 1e-3
         assert DisturbancePerturbation.model_validate_json(one.model_dump_json()) == one
-    pushes = np.array([one.wrench[:3] for one in drawn])
+    pushes = np.array([one.wrench[:3] for one in perturbations])
     directions = pushes / np.linalg.norm(pushes, axis=1, keepdims=True)
     assert np.abs(directions.mean(axis=0)).max() < 0.1, "from no side more often"
 
 
-def refusal(change: DisturbancePerturbation) -> str | None:
+def rejection(change: DisturbancePerturbation) -> str | None:
     try:
         change.apply(SCENE, DEMO, roll_out)
     except RejectedError as error:
@@ -73,15 +73,15 @@ def refusal(change: DisturbancePerturbation) -> str | None:
     return None
 
 
-def test_a_push_at_a_grasp_or_after_the_end_is_refused() -> None:
+def test_a_push_at_a_grasp_or_after_the_end_is_rejected() -> None:
     # The demonstration closes the gripper in its action 32, opens it in action 76, and has 90.
-    refused = {step: reason for step in range(100) if (reason := refusal(pushed_at(step)))}
+    rejected = {step: reason for step in range(100) if (reason := rejection(pushed_at(step)))}
     at_grasp, after_end = [*range(24, 38), *range(68, 82)], [*range(82, 100)]
-    assert refused == dict.fromkeys(at_grasp, "push_at_grasp") | dict.fromkeys(after_end, "push_after_end")
-    assert refusal(pushed_at(28, away_steps=0)) is None
+    assert rejected == dict.fromkeys(at_grasp, "push_at_grasp") | dict.fromkeys(after_end, "push_after_end")
+    assert rejection(pushed_at(28, away_steps=0)) is None
 
 
-def test_draws_are_apart_by_their_impulse_where_they_begin_at_the_same_step() -> None:
+def test_pushes_that_begin_at_the_same_step_are_apart_by_their_impulse() -> None:
     one, stronger, later = pushed_at(8, 20), pushed_at(8, 60), pushed_at(9, 20)
     apart = one.distances_to([one, stronger, later])
     assert apart[:2] == pytest.approx([0.0, 8.0])
@@ -187,7 +187,7 @@ def test_liberos_own_environment_does_the_same_under_the_same_wrench(
 
 
 @pytest.mark.slow
-def test_held_out_draws_push_a_policy_once_and_the_result_says_how(tmp_path: Path) -> None:
+def test_held_out_perturbations_push_a_policy_once_and_the_result_says_how(tmp_path: Path) -> None:
     chosen = Selection(source="own", suites=(BOWL.suite,), tasks=(BOWL.name,), axes=("disturbance",), levels=(5,))
     (task, *_) = select(chosen)
     evaluated = EpisodeEnvironment()

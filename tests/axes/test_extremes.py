@@ -113,7 +113,7 @@ def applied(json: str) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", [name for name in AXES if name != "language"])
-def test_what_is_accepted_is_drawn_recorded_and_applied(name: str) -> None:
+def test_accepted_ranges_are_sampled_recorded_and_applied(name: str) -> None:
     """Language has no numbers but its levels."""
     config = getattr(Axes.model_validate({name: {}}), name).model_dump(mode="json")
     for path, value in fields(config):
@@ -130,23 +130,25 @@ def test_what_is_accepted_is_drawn_recorded_and_applied(name: str) -> None:
 
 def test_of_points_alone_each_comes() -> None:
     """No length of theirs says how often."""
-    drawn = [sample_number(rng("points", number), ((-30.0, -30.0), (10.0, 10.0))) for number in range(100)]
-    assert 30 < drawn.count(-30.0) < 70
-    assert set(drawn) == {-30.0, 10.0}
+    numbers = [sample_number(rng("points", number), ((-30.0, -30.0), (10.0, 10.0))) for number in range(100)]
+    assert 30 < numbers.count(-30.0) < 70
+    assert set(numbers) == {-30.0, 10.0}
     assert sample_number(rng("point"), ((5.0, 5.0),)) == 5.0
 
 
-def recorded(drawn: Perturbation, task: Task) -> str:
+def recorded(perturbation: Perturbation, task: Task) -> str:
     """As a plan has it, but all under one seed, so that the same change is applied once."""
-    assert drawn.nearest(TestSet(()), task).compared == 0
-    one_seed = drawn.model_copy(update={"seed": 0}) if "seed" in type(drawn).model_fields else drawn
+    assert perturbation.nearest(TestSet(()), task).compared == 0
+    one_seed = (
+        perturbation.model_copy(update={"seed": 0}) if "seed" in type(perturbation).model_fields else perturbation
+    )
     return to_json(from_json(to_json([one_seed])))
 
 
-def test_every_task_has_a_draw_of_every_component_of_pose() -> None:
+def test_every_task_has_a_perturbation_of_every_component_of_pose() -> None:
     for task in (task for suite in SUITES for task in tasks(suite)):
         for component in ("target", "receptacle", "scene"):
             axis = PoseAxis.model_validate({"components": [component]})
             if axis.applies(task):
-                (drawn,) = from_json(to_json([axis.sample(rng("every"), task, 0)]))
-                assert drawn.component == component
+                (perturbation,) = from_json(to_json([axis.sample(rng("every"), task, 0)]))
+                assert perturbation.component == component

@@ -1,4 +1,4 @@
-"""Each array of a model can be changed before a camera, and shows as MuJoCo draws it, or is refused with words."""
+"""Each array of a model can be changed before a camera, and shows as MuJoCo renders it, or is rejected with words."""
 
 import copy
 import math
@@ -20,7 +20,7 @@ ROUND = " ".join(
     f"{math.sqrt(1 - z * z) * math.cos(turn):.4f} {math.sqrt(1 - z * z) * math.sin(turn):.4f} {z:.4f}"
     for z, turn in ((2 * (number + 0.5) / 200 - 1, 2.4 * number) for number in range(200))
 )
-"""Of so many corners that its mesh is drawn as a skin."""
+"""Of so many corners that its mesh is rendered as a skin."""
 
 SCENE = f"""
 <mujoco>
@@ -79,7 +79,7 @@ def writes(field: str) -> RenderPerturbation:
 
 
 class Plain:
-    """MuJoCo's own drawing, in a context that is made anew for each picture: it has nothing of the former one."""
+    """MuJoCo's own renderer, in a context that is created again for each picture: it has nothing of the former one."""
 
     def __init__(self) -> None:
         self._option = mujoco.MjvOption()
@@ -160,7 +160,7 @@ def test_the_matrices_of_a_changed_camera_lead_to_where_things_show(
             assert np.allclose([x / z, y / z], [column_px, row_px], atol=0.3)
 
 
-def test_any_other_field_is_refused() -> None:
+def test_any_other_field_is_rejected() -> None:
     others = set(arrays()) - set(FIELDS)
     assert len(others) > 300
     for field in [*others, "vis", "nothing"]:

@@ -172,16 +172,18 @@ def test_tasks_that_share_a_start_begin_in_the_same_state() -> None:
     assert starts[0] == starts[1]
 
 
-def test_draws_are_keyed_and_within_the_configured_levels() -> None:
+def test_perturbations_depend_on_their_key_and_keep_to_the_configured_levels() -> None:
     milk = find_task("libero_object", f"{PICK}milk{BASKET}")
     axis = GoalAxis(levels=(2, 3), starts=4)
-    drawn = [axis.sample(rng(0, "goal", number), milk, number % len(axis.entries(milk))) for number in range(100)]
-    assert drawn == [
+    perturbations = [
         axis.sample(rng(0, "goal", number), milk, number % len(axis.entries(milk))) for number in range(100)
     ]
-    assert {one.level for one in drawn} <= {2, 3}
-    assert {one.start for one in drawn} == {0, 1, 2, 3}
-    assert {one.scene for one in drawn} == set(axis.entries(milk))
+    assert perturbations == [
+        axis.sample(rng(0, "goal", number), milk, number % len(axis.entries(milk))) for number in range(100)
+    ]
+    assert {one.level for one in perturbations} <= {2, 3}
+    assert {one.start for one in perturbations} == {0, 1, 2, 3}
+    assert {one.scene for one in perturbations} == set(axis.entries(milk))
     assert not GoalAxis().applies(tasks("libero_goal")[0])
 
 
@@ -217,7 +219,7 @@ def test_a_rewrite_that_means_two_things_of_the_scene_is_left_out() -> None:
     assert left_out > 0
 
 
-def test_beside_the_axis_goal_every_rewrite_names_its_things() -> None:
+def test_every_rewrite_joined_with_the_axis_goal_names_its_things() -> None:
     """A description such as this one holds in the task's own scene, which has no milk."""
     riddle, test = "find the only thing here that you would pour into a glass and drink", benchmark.load()
     juice = find_task("libero_object", f"{PICK}orange_juice{BASKET}")

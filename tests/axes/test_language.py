@@ -1,4 +1,4 @@
-"""The bank of rewrites is clean and complete, and the draws from it are keyed, distinct and balanced."""
+"""The bank of rewrites is clean and complete, and the samples from it are keyed, distinct and balanced."""
 
 import re
 from collections import Counter
@@ -39,7 +39,7 @@ TASKS = [task for suite in SUITES for task in tasks(suite)]
 BOWL_ON_PLATE = find_task("libero_goal", "put_the_bowl_on_the_plate")
 
 
-def draw(task: Task, variant: int, axis: LanguageAxis | None = None, seed: int = 0) -> LanguagePerturbation:
+def sample(task: Task, variant: int, axis: LanguageAxis | None = None, seed: int = 0) -> LanguagePerturbation:
     return (axis or LanguageAxis()).sample(seeding.rng(seed, "language", task.name, variant), task, variant)
 
 
@@ -121,61 +121,61 @@ def test_normalise_forgets_case_punctuation_and_spacing() -> None:
     assert normalise(" It's  the well-known Plate. ") == "its the well known plate"
 
 
-def test_same_key_gives_the_same_draw(task: Task) -> None:
-    assert draw(task, 7) == draw(task, 7)
+def test_equal_keys_sample_equal_perturbations(task: Task) -> None:
+    assert sample(task, 7) == sample(task, 7)
 
 
 def test_variants_are_distinct_until_the_bank_is_exhausted(task: Task) -> None:
     size = sum(len(texts) for texts in load_bank()[task.suite][task.name].values())
-    texts = [draw(task, variant).text for variant in range(size)]
+    texts = [sample(task, variant).text for variant in range(size)]
     assert len(set(texts)) == size
 
 
 def test_an_exhausted_bank_starts_again() -> None:
     size = sum(len(texts) for texts in load_bank()[TASKS[0].suite][TASKS[0].name].values())
-    assert [draw(TASKS[0], size + n) for n in range(4)] == [draw(TASKS[0], n) for n in range(4)]
+    assert [sample(TASKS[0], size + n) for n in range(4)] == [sample(TASKS[0], n) for n in range(4)]
 
 
 def test_successive_variants_go_through_the_classes(task: Task) -> None:
     for start in range(0, MIN_PER_CLASS * len(CLASSES), len(CLASSES)):
-        assert {draw(task, start + i).component for i in range(len(CLASSES))} == set(CLASSES)
+        assert {sample(task, start + i).component for i in range(len(CLASSES))} == set(CLASSES)
 
 
 def test_every_class_comes_first_for_some_task() -> None:
-    assert {draw(task, 0).component for task in TASKS} == set(CLASSES)
+    assert {sample(task, 0).component for task in TASKS} == set(CLASSES)
 
 
-def test_only_configured_classes_are_drawn(task: Task) -> None:
+def test_only_configured_classes_are_sampled(task: Task) -> None:
     axis = LanguageAxis(components=("paraphrase", "common_sense"))
-    assert {draw(task, variant, axis).component for variant in range(8)} == {"paraphrase", "common_sense"}
+    assert {sample(task, variant, axis).component for variant in range(8)} == {"paraphrase", "common_sense"}
 
 
-def test_text_is_drawn_from_the_class_it_names(task: Task) -> None:
+def test_text_is_sampled_from_the_class_it_names(task: Task) -> None:
     for variant in range(8):
-        drawn = draw(task, variant)
-        assert drawn.text in load_bank()[task.suite][task.name][drawn.component]
-        assert drawn.apply(task.instruction) == drawn.text
+        perturbation = sample(task, variant)
+        assert perturbation.text in load_bank()[task.suite][task.name][perturbation.component]
+        assert perturbation.apply(task.instruction) == perturbation.text
 
 
 def test_perturbation_survives_json() -> None:
-    drawn = draw(TASKS[0], 0)
-    assert LanguagePerturbation.model_validate_json(drawn.model_dump_json()) == drawn
+    perturbation = sample(TASKS[0], 0)
+    assert LanguagePerturbation.model_validate_json(perturbation.model_dump_json()) == perturbation
 
 
 def test_unknown_task_is_named_with_the_file_and_a_remedy() -> None:
     juggle = Task("libero_goal", "juggle", "juggle", Path("juggle.bddl"))
     with pytest.raises(PipelineError, match=r"language_bank\.yaml.*libero_goal/juggle(?s:.*)try: add rewrites"):
-        draw(juggle, 0)
+        sample(juggle, 0)
 
 
-def test_rewrite_equal_to_the_instruction_is_refused() -> None:
+def test_a_rewrite_equal_to_the_instruction_is_rejected() -> None:
     known = TASKS[0]
-    wording = draw(known, 0).text
+    wording = sample(known, 0).text
     with pytest.raises(PipelineError, match="equal to the original"):
-        draw(Task(known.suite, known.name, wording, known.bddl_file), 0)
+        sample(Task(known.suite, known.name, wording, known.bddl_file), 0)
 
 
-def test_no_classes_is_refused() -> None:
+def test_an_axis_without_classes_is_rejected() -> None:
     with pytest.raises(ValidationError):
         LanguageAxis(components=())
     former = LanguageAxis.model_validate({"classes": ["paraphrase"]})
@@ -202,13 +202,13 @@ def test_levels_follow_the_distance_to_the_original(task: Task) -> None:
     }
 
 
-def test_only_the_levels_asked_for_are_drawn() -> None:
+def test_only_the_levels_asked_for_are_sampled() -> None:
     levels: tuple[Level, ...] = (1, 5)
     axis = LanguageAxis(levels=levels)
     for known in TASKS[::7]:
-        drawn = [draw(known, variant, axis) for variant in range(60)]
-        assert {card.level for card in drawn} <= set(levels)
-        assert {card.text for card in drawn} == {card.text for card in list_rewrites(known) if card.level in levels}
+        rewrites = [sample(known, variant, axis) for variant in range(60)]
+        assert {card.level for card in rewrites} <= set(levels)
+        assert {card.text for card in rewrites} == {card.text for card in list_rewrites(known) if card.level in levels}
     assert {card.level for known in TASKS for card in list_rewrites(known)} == {1, 2, 3, 4, 5}
 
 
@@ -350,12 +350,12 @@ def test_of_a_wording_in_both_banks_and_two_classes_the_first_counts(tmp_path: P
     new = f"kindly {known.instruction}"
     further = {"distraction": [*again, new], "paraphrase": [*shipped, new.replace("kindly", "kindly,")]}
     bank.write_text(yaml.safe_dump({known.suite: {known.name: further}}))
-    drawn = {(card.component, card.text) for card in list_rewrites(known, bank=bank)}
-    assert drawn - {(card.component, card.text) for card in list_rewrites(known)} == {("distraction", new)}
+    rewrites = {(card.component, card.text) for card in list_rewrites(known, bank=bank)}
+    assert rewrites - {(card.component, card.text) for card in list_rewrites(known)} == {("distraction", new)}
     assert len(list_rewrites(known, bank=bank)) == len(list_rewrites(known)) + 1
 
 
-def test_a_bank_with_a_task_given_twice_is_refused(tmp_path: Path) -> None:
+def test_a_bank_with_a_task_given_twice_is_rejected(tmp_path: Path) -> None:
     bank = tmp_path / "bank.yaml"
     bank.write_text("libero_goal:\n  stove: {paraphrase: []}\n  stove: {distraction: []}\n")
     with pytest.raises(PipelineError, match="the key 'stove' is repeated"):

@@ -1,4 +1,4 @@
-"""A rewrite that changes its task's goal is refused with the reason; one that keeps it is not, however it is put."""
+"""A rewrite that changes its task's goal is rejected with the reason; one that keeps it is not, however it is put."""
 
 import re
 from collections.abc import Callable
@@ -19,7 +19,7 @@ CHEESE = find_task("libero_object", "pick_up_the_cream_cheese_and_place_it_in_th
 BETWEEN = find_task(
     "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
 )
-BESIDE = find_task("libero_spatial", "pick_up_the_black_bowl_next_to_the_plate_and_place_it_on_the_plate")
+NEXT_TO = find_task("libero_spatial", "pick_up_the_black_bowl_next_to_the_plate_and_place_it_on_the_plate")
 DRAWER = find_task("libero_goal", "open_the_middle_drawer_of_the_cabinet")
 INTO_DRAWER = find_task("libero_goal", "open_the_top_drawer_and_put_the_bowl_inside")
 ON_CABINET = find_task("libero_goal", "put_the_bowl_on_top_of_the_cabinet")
@@ -75,7 +75,7 @@ def test_every_task_of_libero_demands_what_its_own_wording_tells(suite: str) -> 
         # Another relation.
         (SOUP, "put the alphabet soup next to the basket", "relation 'in' to the basket"),
         (SOUP, "in a hurry today, so just leave the alphabet soup behind the basket", "relation 'in' to the basket"),
-        (BESIDE, "move the black bowl next to the plate", "relation 'on' to the plate"),
+        (NEXT_TO, "move the black bowl next to the plate", "relation 'on' to the plate"),
         (
             BETWEEN,
             "take the black bowl between the plate and the ramekin and put it behind the plate",
@@ -98,7 +98,7 @@ def test_every_task_of_libero_demands_what_its_own_wording_tells(suite: str) -> 
         (TWO, "put the alphabet soup in the basket", "no word for the cream cheese"),
         (POTS, "put the moka pot on the stove", "both moka pots"),
         # Another start, of two bowls.
-        (BESIDE, "put the black bowl on the plate", "relation 'next to' to the plate"),
+        (NEXT_TO, "put the black bowl on the plate", "relation 'next to' to the plate"),
         (BETWEEN, "put the black bowl beside the ramekin on the plate", "relation 'between'"),
         # The opposite, or nothing.
         (DRAWER, "close the middle drawer of the cabinet", "ask to open"),
@@ -119,7 +119,7 @@ def test_every_task_of_libero_demands_what_its_own_wording_tells(suite: str) -> 
         ),
     ],
 )
-def test_a_changed_goal_is_refused_with_the_reason(task: Task, text: str, fault: str) -> None:
+def test_a_changed_goal_is_rejected_with_the_reason(task: Task, text: str, fault: str) -> None:
     for component in NAMED:
         assert fault in str(lint(text, task, component))
     assert lint(text, task, "reasoning_chain") is not None
@@ -173,7 +173,7 @@ def test_no_other_task_of_a_scene_is_taken_for_a_rewrite() -> None:
     assert accepted == []
 
 
-def test_rewrites_of_another_task_of_the_scene_are_refused_where_things_have_their_names() -> None:
+def test_rewrites_of_another_task_of_the_scene_are_rejected_where_things_have_their_names() -> None:
     """The shipped rewrites that call things by their names, as rewrites of the scene's other tasks."""
     groups = {task: group for group in by_scene().values() for task in group}
     checked, accepted = 0, []
@@ -204,7 +204,7 @@ def test_no_instruction_of_libero_asks_for_more_than_its_task(suite: str) -> Non
         ("turn on the stove, then open the middle drawer of the cabinet", "open the wooden cabinet too"),
     ],
 )
-def test_a_second_request_is_refused(text: str, fault: str) -> None:
+def test_a_second_request_is_rejected(text: str, fault: str) -> None:
     assert fault in str(lint(text, STOVE, "paraphrase"))
     assert fault in str(lint(text, STOVE, "reasoning_chain"))
 

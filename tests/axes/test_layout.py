@@ -66,7 +66,9 @@ def restored(scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
-def test_the_same_draw_gives_the_same_scene(three: LayoutPerturbation, base: Scene, demo: Demo, changed: Scene) -> None:
+def test_equal_perturbations_give_equal_scenes(
+    three: LayoutPerturbation, base: Scene, demo: Demo, changed: Scene
+) -> None:
     again = LayoutPerturbation.model_validate_json(three.model_dump_json()).apply(base, demo, roll_out)
     assert again.model_xml == changed.model_xml
     assert again.state.tobytes() == changed.state.tobytes()
@@ -75,10 +77,10 @@ def test_the_same_draw_gives_the_same_scene(three: LayoutPerturbation, base: Sce
 
 def test_the_level_is_the_number_of_objects() -> None:
     for level in (1, 2, 3, 4, 5):
-        drawn = [LayoutAxis(levels=(level,)).sample(seeding.rng(level, key), PLATE, 0) for key in range(20)]
-        assert {(one.level, len(one.objects)) for one in drawn} == {(level, level)}
-        assert len({one.seed for one in drawn}) == 20, "each has places of its own"
-        models_of = [models(LayoutAxis().sources)[added.name] for one in drawn for added in one.objects]
+        perturbations = [LayoutAxis(levels=(level,)).sample(seeding.rng(level, key), PLATE, 0) for key in range(20)]
+        assert {(one.level, len(one.objects)) for one in perturbations} == {(level, level)}
+        assert len({one.seed for one in perturbations}) == 20, "each has places of its own"
+        models_of = [models(LayoutAxis().sources)[added.name] for one in perturbations for added in one.objects]
         assert max(model.shape.footprint_m2 for model in models_of) <= 0.12 / level, "the more, the smaller"
 
 
@@ -100,7 +102,7 @@ def test_a_model_comes_twice_as_often_as_in_the_test_set() -> None:
             added = axis.sample(seeding.rng("twice", key), PLATE, key).objects
             assert len({one.name for one in added}) == len({one.category for one in added})
             twice += len(set(added)) < level
-        # Three standard deviations of 200 draws, and of the 106 to 207 test tasks.
+        # Three standard deviations of 200 samples, and of the 106 to 207 test tasks.
         assert twice / 200 == pytest.approx(np.mean(tested[level]), abs=0.12)
 
 
@@ -123,19 +125,19 @@ def test_regions_are_those_of_the_test_set() -> None:
 
 @pytest.mark.parametrize("arena", ["tabletop", "kitchen", "living_room", "floor"])
 def test_places_are_on_the_cameras_side_as_often_as_the_test_s(arena: Arena) -> None:
-    """At x > 0.19 m, where a place is drawn first; one that does not fit there is drawn in the other region."""
+    """At x > 0.19 m, where a place is sampled first; one that does not fit there is sampled in the other region."""
     tested = [
         float(pair.split(",")[0])
         for test in benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis("layout")
         if test.parameters["arena"] == arena
         for pair in str(test.parameters["positions"]).split(";")
     ]
-    drawn = []
+    sampled = []
     for key in range(1000):
         keyed = seeding.rng("side", arena, key)
         first, _ = ARENAS[arena].regions.order(keyed)
-        drawn.append(first.sample(keyed)[0])
-    assert np.mean(np.array(drawn) > 0.19) == pytest.approx(np.mean(np.array(tested) > 0.19), abs=0.13)
+        sampled.append(first.sample(keyed)[0])
+    assert np.mean(np.array(sampled) > 0.19) == pytest.approx(np.mean(np.array(tested) > 0.19), abs=0.13)
 
 
 def within(region: Region, at_m: Sequence[float]) -> bool:
@@ -234,7 +236,7 @@ def test_objects_stand_in_the_regions_of_the_arena(changed: Scene) -> None:
 
 
 def test_objects_hide_a_third_of_a_thing_at_most(tmp_path: Path, base: Scene, demo: Demo) -> None:
-    """Rendered: posts, which hide more than small objects do; for these, one place was refused for it."""
+    """Rendered: posts, which hide more than small objects do; for these, one place was rejected for it."""
     file = tmp_path / "post.xml"
     file.write_text('<mujoco><worldbody><body><geom type="box" size=".05 .03 .14"/></body></worldbody></mujoco>')
     crowded = place(base, demo, [ObjectModel("own/post", "post", "", "", file)] * 4, seed=3, roll_out=roll_out)
@@ -259,7 +261,7 @@ def test_every_object_shows_as_much_as_was_recorded(changed: Scene) -> None:
     renderer.close()
     recorded_px = [placed["seen_px"] for placed in changed.resolved["layout"]["objects"]]
     assert min(rendered_px) >= SEEN_PX
-    # At an outline, a ray may meet another thing than is drawn.
+    # At an outline, a ray may meet another thing than is rendered.
     np.testing.assert_allclose(recorded_px, rendered_px, rtol=0.1, atol=10)
 
 
@@ -281,16 +283,16 @@ def test_the_demonstration_still_succeeds_among_the_objects(
     assert np.abs(trajectory.states[-1, -18:]).max() < 0.05, "nothing was knocked over"
 
 
-def test_impossible_wishes_are_refused_with_their_reason(tmp_path: Path, base: Scene, demo: Demo) -> None:
+def test_impossible_wishes_are_rejected_with_their_reason(tmp_path: Path, base: Scene, demo: Demo) -> None:
     file = tmp_path / "crate.xml"
     file.write_text('<mujoco><worldbody><body><geom type="box" size=".25 .25 .25"/></body></worldbody></mujoco>')
     crate = ObjectModel("own/crate", "crate", "", "", file)
-    with pytest.raises(RejectedError) as refused:
+    with pytest.raises(RejectedError) as rejected:
         place(base, demo, [crate] * 5, seed=0, roll_out=roll_out)
-    assert refused.value.reason in ("layout_in_the_way", "layout_out_of_view", "layout_off_the_surface")
+    assert rejected.value.reason in ("layout_in_the_way", "layout_out_of_view", "layout_off_the_surface")
 
 
-def test_an_object_that_is_another_now_is_refused(three: LayoutPerturbation, base: Scene, demo: Demo) -> None:
+def test_an_object_that_has_changed_is_rejected(three: LayoutPerturbation, base: Scene, demo: Demo) -> None:
     stale = three.objects[0].model_copy(update={"sha256": "0" * 64})
     with pytest.raises(PipelineError, match="differs from the planned object"):
         LayoutPerturbation(level=1, objects=(stale,), seed=0).apply(base, demo, roll_out)

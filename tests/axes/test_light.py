@@ -1,4 +1,4 @@
-"""Light: every lamp of every arena, only what renders, and frames that stay legible at the strongest draws."""
+"""Light: every lamp of every arena, only what renders, and frames that stay legible at the strongest perturbations."""
 
 import colorsys
 from collections.abc import Iterator
@@ -27,22 +27,22 @@ NOTICED_LEVELS, NOTICED_SHARE = 8, 0.05
 """A change is noticed where this share of the pixels differs by so many grey levels in a channel."""
 
 
-def drawn(component: Component, level: Level, key: str | int, task: Task = MILK) -> LightPerturbation:
+def sample(component: Component, level: Level, key: str | int, task: Task = MILK) -> LightPerturbation:
     axis = LightAxis(components=(component,), levels=(level,))
     return axis.sample(rng("light", component, level, key), task, 0)
 
 
 def weakest(task: Task) -> Iterator[LightPerturbation]:
-    """A draw of each component at level 1; ``test_stronger_levels_change_more`` compares level 5 with it, in one arena.
+    """Samples of each component at level 1; ``test_stronger_levels_change_more`` compares level 5 with them.
 
-    Of ``diffuse`` it is a darker, a brighter and a tinted one, where drawn; of ``combined`` one with shadows and one
+    Of ``diffuse`` it is a darker, a brighter and a tinted one, where sampled; of ``combined`` one with shadows and one
     without; of ``direction`` one for each edge of the range of the azimuth, where a tilt changes least. Last comes the
     weakest tint in yellow, a hue that changes least in the study.
     """
     for component in COMPONENTS:
         kinds: dict[object, LightPerturbation] = {}
         for key in range(20 if component in ("diffuse", "combined") else 1):
-            one = drawn(component, 1, key, task)
+            one = sample(component, 1, key, task)
             tint = "tinted" if len({*one.diffuse_scale_rgb}) > 1 else one.diffuse_scale_rgb[0] > 1
             kinds[tint if component == "diffuse" else one.shadows] = one
         if component == "direction":
@@ -57,7 +57,7 @@ def share_changed(before: Frame, after: Frame) -> float:
     return float((np.abs(before.astype(int) - after).max(axis=2) >= NOTICED_LEVELS).mean())
 
 
-def test_draws_are_keyed_recorded_and_touch_their_property_alone() -> None:
+def test_perturbations_depend_on_their_key_read_back_and_change_their_property_alone() -> None:
     properties = {
         "diffuse": {"diffuse_scale_rgb"},
         "direction": {"tilt_deg", "tilt_azimuth_deg"},
@@ -75,17 +75,17 @@ def test_draws_are_keyed_recorded_and_touch_their_property_alone() -> None:
 
 
 def test_the_four_properties_mostly_change_together() -> None:
-    draws = [LightAxis().sample(rng("key", key), MILK, 0) for key in range(1000)]
-    combined = [one for one in draws if one.component == "combined"]
+    perturbations = [LightAxis().sample(rng("key", key), MILK, 0) for key in range(1000)]
+    combined = [one for one in perturbations if one.component == "combined"]
     assert len(combined) == pytest.approx(600, abs=50)
     assert sum(one.shadows for one in combined) == pytest.approx(len(combined) / 2, abs=50)
     for component in ("diffuse", "direction", "specular", "shadows"):
-        assert sum(one.component == component for one in draws) == pytest.approx(100, abs=30)
-    tints = [one.diffuse_scale_rgb for one in draws if len({*one.diffuse_scale_rgb}) > 1]
+        assert sum(one.component == component for one in perturbations) == pytest.approx(100, abs=30)
+    tints = [one.diffuse_scale_rgb for one in perturbations if len({*one.diffuse_scale_rgb}) > 1]
     for brightest in range(3):
         assert sum(np.argmax(tint) == brightest for tint in tints) == pytest.approx(len(tints) / 3, abs=50)
     # Uniform from 135 to 270 degrees.
-    azimuths_deg = [one.tilt_azimuth_deg for one in draws if one.tilt_deg]
+    azimuths_deg = [one.tilt_azimuth_deg for one in perturbations if one.tilt_deg]
     assert np.percentile(azimuths_deg, [10, 50, 90]) == pytest.approx([148.5, 202.5, 256.5], abs=5)
 
 
@@ -98,7 +98,7 @@ def test_the_four_properties_mostly_change_together() -> None:
         (("diffuse", "combined"), 1.0, {"combined"}),
     ],
 )
-def test_the_share_of_combined_draws_is_among_the_components(
+def test_the_share_of_combined_perturbations_is_among_the_components(
     components: tuple[Component, ...], share: float, expected: set[Component]
 ) -> None:
     axis = LightAxis(components=components, combined_share=share)
@@ -107,9 +107,9 @@ def test_the_share_of_combined_draws_is_among_the_components(
 
 def test_ranges_grow_with_the_level() -> None:
     for component, name in (("direction", "tilt_deg"), ("specular", "specular_scale"), ("shadows", "tilt_deg")):
-        values = [abs(getattr(drawn(component, level, 0), name)) for level in (1, 2, 3, 4, 5)]  # type: ignore[arg-type]
+        values = [abs(getattr(sample(component, level, 0), name)) for level in (1, 2, 3, 4, 5)]  # type: ignore[arg-type]
         assert values == sorted(set(values))
-    fills = [drawn("shadows", level, 0).fill_scale for level in (1, 2, 3, 4, 5)]
+    fills = [sample("shadows", level, 0).fill_scale for level in (1, 2, 3, 4, 5)]
     assert fills == sorted(set(fills), reverse=True)
 
 
@@ -120,10 +120,10 @@ LAMPS = """
 
 
 def test_no_recorded_brightness_is_lost_in_shadows() -> None:
-    """Lamps with shadows are limited: what is recorded as brighter must not look like another draw."""
+    """Lamps with shadows are limited: what is recorded as brighter must not look like another perturbation."""
     shown: dict[float, float] = {}
     for key in range(200):
-        one = drawn("combined", 1 + key % 5, key)  # type: ignore[arg-type]
+        one = sample("combined", 1 + key % 5, key)  # type: ignore[arg-type]
         if one.shadows and len({*one.diffuse_scale_rgb}) == 1:
             model = mujoco.MjModel.from_xml_string(LAMPS)
             NEUTRAL.model_copy(update={"diffuse_scale_rgb": one.diffuse_scale_rgb, "shadows": True}).apply(model)
@@ -159,7 +159,7 @@ def test_every_lamp_changes_and_nothing_but_lamps(shown: Renderer, request: pyte
     before, clean = checksums(shown), frames(shown)
     directions, colours = shown.model.light_dir.copy(), shown.model.light_diffuse.copy()
     places = shown.model.light_pos.copy()
-    everything = next(one for key in range(20) if (one := drawn("combined", 5, key)).shadows)
+    everything = next(one for key in range(20) if (one := sample("combined", 5, key)).shadows)
     with shown.perturbed([everything]):
         assert changed(before, checksums(shown)) <= set(LightPerturbation.fields)
         assert np.array_equal(shown.model.light_pos, places)
@@ -198,7 +198,7 @@ def test_stronger_levels_change_more(shown: Renderer) -> None:
     for component in COMPONENTS:
         for level, changes in ((1, weak), (5, strong)):
             for key in range(3):
-                with shown.perturbed([drawn(component, level, key)]):  # type: ignore[arg-type]
+                with shown.perturbed([sample(component, level, key)]):  # type: ignore[arg-type]
                     after = frames(shown, ["agentview"])["agentview"]
                 changes[component].append(change(clean, after))
     for component in COMPONENTS:
@@ -244,7 +244,7 @@ def test_exposure_names_what_is_wrong() -> None:
 
 
 def test_it_claims_no_proof_that_cannot_be_had() -> None:
-    nearest = drawn("diffuse", 1, 0).nearest(TestSet(()), MILK)
+    nearest = sample("diffuse", 1, 0).nearest(TestSet(()), MILK)
     assert nearest.compared == 0
     assert nearest.distance >= LightPerturbation.clearance
     assert "unknown" in LightPerturbation.measure

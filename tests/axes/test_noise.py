@@ -1,4 +1,4 @@
-"""Each corruption equals an independent implementation of it, and its draws are keyed and off the test grid."""
+"""Each corruption equals an independent implementation of it, and its samples are keyed and off the test grid."""
 
 import json
 import math
@@ -182,10 +182,10 @@ def naive_glass(frame: Frame, effect: Glass, offsets: NDArray[np.int8]) -> Frame
     """The loop as ImageNet-C and LIBERO-Plus write it, with what looks like a swap of two pixels."""
     height, width, _ = frame.shape
     out = to_frame(gaussian(frame / 255, effect.sigma_px, channel_axis=-1))
-    for drawn in offsets:
+    for pass_offsets in offsets:
         for y in range(height - effect.delta_px, effect.delta_px, -1):
             for x in range(width - effect.delta_px, effect.delta_px, -1):
-                dy, dx = (int(offset) for offset in drawn[y, x])
+                dy, dx = (int(offset) for offset in pass_offsets[y, x])
                 out[y, x], out[y + dy, x + dx] = out[y + dy, x + dx], out[y, x]
     return to_frame(gaussian(out / 255, effect.sigma_px, channel_axis=-1))
 
@@ -335,16 +335,16 @@ def test_the_default_grid_is_clear(component: str, test: TestSet) -> None:
     assert min(distances) >= 0.39 > NoisePerturbation.clearance
 
 
-def test_only_the_levels_asked_for_are_drawn() -> None:
+def test_only_the_levels_asked_for_are_sampled() -> None:
     axis = NoiseAxis(levels=(2, 5))
-    drawn = [axis.sample(seeding.rng(seed, "noise"), TASK, 0) for seed in range(200)]
-    assert {(p.component, p.level) for p in drawn} == {
+    perturbations = [axis.sample(seeding.rng(seed, "noise"), TASK, 0) for seed in range(200)]
+    assert {(p.component, p.level) for p in perturbations} == {
         (component, level) for component in COMPONENTS for level in (2, 5)
     }
-    assert all(p.effect == levels(p.component)[p.level - 1] for p in drawn)
+    assert all(p.effect == levels(p.component)[p.level - 1] for p in perturbations)
 
 
-def test_only_the_components_asked_for_are_drawn() -> None:
+def test_only_the_components_asked_for_are_sampled() -> None:
     axis = NoiseAxis.model_validate({"components": ["gaussian_blur"]})
     assert {axis.sample(seeding.rng(seed, "noise"), TASK, 0).component for seed in range(50)} == {"gaussian_blur"}
     with pytest.raises(ValidationError, match="components"):
@@ -372,18 +372,18 @@ def sample(seed: int) -> NoisePerturbation:
     return AXIS.sample(seeding.rng(seed, "noise"), TASK, 0)
 
 
-def test_every_component_and_level_is_drawn() -> None:
-    drawn = {(p.component, p.level) for p in map(sample, range(400))}
-    assert drawn == {(component, level) for component in COMPONENTS for level in range(1, 6)}
+def test_every_component_and_level_is_sampled() -> None:
+    sampled = {(p.component, p.level) for p in map(sample, range(400))}
+    assert sampled == {(component, level) for component in COMPONENTS for level in range(1, 6)}
 
 
 @given(st.integers())
-def test_same_key_same_draw_and_json_reads_back(seed: int) -> None:
-    drawn = sample(seed)
-    assert drawn == sample(seed)
-    assert drawn != sample(seed + 1)
-    assert drawn.effect == levels(drawn.component)[drawn.level - 1]
-    assert NoisePerturbation.model_validate_json(drawn.model_dump_json()) == drawn
+def test_equal_keys_sample_equal_perturbations_and_json_reads_back(seed: int) -> None:
+    sampled = sample(seed)
+    assert sampled == sample(seed)
+    assert sampled != sample(seed + 1)
+    assert sampled.effect == levels(sampled.component)[sampled.level - 1]
+    assert NoisePerturbation.model_validate_json(sampled.model_dump_json()) == sampled
 
 
 @settings(max_examples=60, deadline=None)
@@ -436,7 +436,7 @@ def test_levels_grow_stronger(component: str) -> None:
     [{"component": "fog"}, {"level": 0}, {"level": 6}, {"effect": {"sigma_px": 0}}, {"effect": {"sigma": 3.5}}],
     ids=str,
 )
-def test_wrong_records_are_refused(change: dict[str, object]) -> None:
+def test_wrong_records_are_rejected(change: dict[str, object]) -> None:
     right = {"axis": "noise", "component": "gaussian_blur", "effect": {"sigma_px": 3.5}, "level": 2, "seed": 1}
     assert NoisePerturbation.model_validate(right).effect == Gaussian(sigma_px=3.5)
     with pytest.raises(ValidationError):

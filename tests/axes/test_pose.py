@@ -60,15 +60,15 @@ def moved(target: str, dx_m: float = 0.0, dy_m: float = 0.0, dyaw_deg: float = 0
 TARGET = PoseAxis(components=("target",))
 
 
-def draws(axis: PoseAxis, task: Task, count: int) -> list[PosePerturbation]:
-    drawn = [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
-    return [one for one in drawn if isinstance(one, PosePerturbation)]
+def sample_many(axis: PoseAxis, task: Task, count: int) -> list[PosePerturbation]:
+    perturbations = [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
+    return [one for one in perturbations if isinstance(one, PosePerturbation)]
 
 
-def scene_draws(task: Task, count: int, level: Level) -> list[ScenePerturbation]:
+def sample_scenes(task: Task, count: int, level: Level) -> list[ScenePerturbation]:
     axis = PoseAxis(levels=(level,), components=("scene",))
-    drawn = [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
-    return [one for one in drawn if isinstance(one, ScenePerturbation)]
+    perturbations = [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
+    return [one for one in perturbations if isinstance(one, ScenePerturbation)]
 
 
 def together(**moves: tuple[float, float]) -> ScenePerturbation:
@@ -76,20 +76,20 @@ def together(**moves: tuple[float, float]) -> ScenePerturbation:
     return ScenePerturbation(level=1, moves=listed)
 
 
-def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
-    drawn = draws(TARGET, PLATE, 500)
-    assert drawn == draws(TARGET, PLATE, 500)
-    assert {p.level for p in drawn} == {1, 2, 3, 4, 5}
-    for p in drawn:
+def test_perturbations_depend_on_their_key_and_are_as_large_as_their_level() -> None:
+    perturbations = sample_many(TARGET, PLATE, 500)
+    assert perturbations == sample_many(TARGET, PLATE, 500)
+    assert {p.level for p in perturbations} == {1, 2, 3, 4, 5}
+    for p in perturbations:
         assert 0.016 * (p.level - 1) - 1e-4 <= math.hypot(p.dx_m, p.dy_m) <= 0.016 * p.level + 1e-4
         assert p.moved == "plate_1"
-    assert np.abs(np.mean([(p.dx_m, p.dy_m) / np.hypot(p.dx_m, p.dy_m) for p in drawn], axis=0)).max() < 0.1
+    assert np.abs(np.mean([(p.dx_m, p.dy_m) / np.hypot(p.dx_m, p.dy_m) for p in perturbations], axis=0)).max() < 0.1
     for level in (1, 5):
-        turns_deg = np.array([p.dyaw_deg for p in drawn if p.level == level])
+        turns_deg = np.array([p.dyaw_deg for p in perturbations if p.level == level])
         assert -20 <= turns_deg.min() < -15, "as far at level 1 as at level 5"
         assert 15 < turns_deg.max() <= 20
     assert PoseAxis().sample(rng(1), STOVE, 0).component == "scene", "every task has something to move"
-    assert PosePerturbation.model_validate_json(drawn[0].model_dump_json()) == drawn[0]
+    assert PosePerturbation.model_validate_json(perturbations[0].model_dump_json()) == perturbations[0]
 
 
 def test_the_target_is_what_the_goal_moves() -> None:
@@ -97,7 +97,7 @@ def test_the_target_is_what_the_goal_moves() -> None:
     suites = select_tasks(SUITES)
     still = [task for task in suites if not axis.applies(task)]
     assert [task.name for task in still] == ["open_the_middle_drawer_of_the_cabinet", "turn_on_the_stove"]
-    targets = {task: {p.moved for p in draws(axis, task, 12)} for task in suites if task not in still}
+    targets = {task: {p.moved for p in sample_many(axis, task, 12)} for task in suites if task not in still}
     assert targets[MILK] == {"milk_1"}
     assert targets[COOKIES] == {BOWL}
     assert targets[POTS] == {"moka_pot_1", "moka_pot_2"}
@@ -132,16 +132,18 @@ def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
         (COOKIES, moved(BOWL, -0.08), "object_in_collision"),
     ],
 )
-def test_what_cannot_be_is_refused(task: Task, change: PosePerturbation, reason: str, scenes: Scenes) -> None:
+def test_impossible_perturbations_are_rejected(
+    task: Task, change: PosePerturbation, reason: str, scenes: Scenes
+) -> None:
     with pytest.raises(RejectedError, match=reason):
         change.apply(scenes(task), starter_demo(task), roll_out)
 
 
 def test_a_receptacle_moves_when_asked_for_and_the_targets_relation_still_holds(scenes: Scenes) -> None:
     axis = PoseAxis(components=("receptacle",))
-    assert {(p.component, p.moved) for p in draws(axis, MILK, 6)} == {("receptacle", "basket_1")}
+    assert {(p.component, p.moved) for p in sample_many(axis, MILK, 6)} == {("receptacle", "basket_1")}
     both = PoseAxis(components=("target", "receptacle"))
-    assert {p.moved for p in draws(both, BETWEEN, 12)} == {BOWL, "plate_1"}
+    assert {p.moved for p in sample_many(both, BETWEEN, 12)} == {BOWL, "plate_1"}
     assert not axis.applies(PLATE), "the plate goes to a place on the table"
     change = moved("plate_1", 0.01, 0.01, 5)
     assert change.apply(scenes(BETWEEN), starter_demo(BETWEEN), roll_out).resolved["pose"]["moved"] == "plate_1"
@@ -216,10 +218,10 @@ def test_a_scene_moves_everything_within_the_benchmarks_disks(task: Task) -> Non
     surface = {"main_table", "kitchen_table", "living_room_table", "study_table", "floor"}
     levels: tuple[Level, ...] = (1, 5)
     for level in levels:
-        drawn = scene_draws(task, 8, level)
-        assert drawn == scene_draws(task, 8, level)
-        assert len(set(drawn)) == 8
-        for one in drawn:
+        perturbations = sample_scenes(task, 8, level)
+        assert perturbations == sample_scenes(task, 8, level)
+        assert len(set(perturbations)) == 8
+        for one in perturbations:
             (read,) = from_json(to_json([one]))
             assert (read, one.axis, one.component, one.level) == (one, "pose", "scene", level)
             shifts = {move.name: np.array([move.dx_m, move.dy_m]) for move in one.moves}
@@ -236,15 +238,15 @@ def test_a_scene_moves_everything_within_the_benchmarks_disks(task: Task) -> Non
 
 
 def test_a_scenes_moves_are_uniform_over_the_disk() -> None:
-    drawn = scene_draws(MILK, 200, 1)
-    moves_m = np.array([(move.dx_m, move.dy_m) for one in drawn for move in one.moves if move.name == "milk_1"])
+    perturbations = sample_scenes(MILK, 200, 1)
+    moves_m = np.array([(move.dx_m, move.dy_m) for one in perturbations for move in one.moves if move.name == "milk_1"])
     assert np.abs(moves_m.mean(axis=0)).max() < 0.004
     assert np.mean(np.linalg.norm(moves_m, axis=1) < 0.015) == pytest.approx(1 / 4, abs=0.08), "of a radius of 0.03"
 
 
 def test_the_goal_suites_bowl_goes_where_the_benchmark_has_it_unless_the_hand_needs_it() -> None:
     def median(task: Task, name: str) -> list[float]:
-        moves = [move for one in scene_draws(task, 100, 5) for move in one.moves if move.name == name]
+        moves = [move for one in sample_scenes(task, 100, 5) for move in one.moves if move.name == name]
         return list(np.median([[move.dx_m, move.dy_m] for move in moves], axis=0))
 
     assert median(STOVE, BOWL) == pytest.approx([0.35, 0.05], abs=0.02)
@@ -258,7 +260,7 @@ def test_a_level_bounds_how_far_things_move_also_in_the_goal_suite() -> None:
     """LIBERO-Plus's places, up to 35 cm away, are level 5; a configuration without this level has none of them."""
     goal = PoseAxis(components=("scene",))
     for level in (1, 2, 3, 4):
-        for scene in scene_draws(STOVE, 20, level):
+        for scene in sample_scenes(STOVE, 20, level):
             assert max(math.hypot(move.dx_m, move.dy_m) for move in scene.moves) <= 0.02 * level + 1e-4
     scenes = [goal.sample(rng("goal", key), STOVE, 0) for key in range(100)]
     assert {scene.level for scene in scenes} == {5}
@@ -293,7 +295,7 @@ def test_a_fixture_takes_along_what_stands_on_it(scenes: Scenes) -> None:
 @pytest.mark.parametrize(
     ("task", "moves", "reason"),
     [
-        # The stove is drawn away under the bowl.
+        # The stove is pulled away under the bowl.
         (ON_STOVE, {"flat_stove_1": (0.0, -0.15)}, "object_in_collision|relation_broken|object_unstable"),
         (ON_STOVE, {"plate_1": (-0.26, 0.0)}, "object_in_collision"),
         # Two fixtures, between which the simulator itself has no contacts.
@@ -302,7 +304,7 @@ def test_a_fixture_takes_along_what_stands_on_it(scenes: Scenes) -> None:
         (PLATE, {"plate_1": (1.0, 0.0)}, "relation_broken"),
     ],
 )
-def test_a_scene_that_cannot_be_is_refused(
+def test_an_impossible_scene_is_rejected(
     task: Task, moves: dict[str, tuple[float, float]], reason: str, scenes: Scenes
 ) -> None:
     with pytest.raises(RejectedError, match=reason):

@@ -36,7 +36,7 @@ def turned(*offsets: float) -> RobotPerturbation:
     return RobotPerturbation.model_validate({"component": "initial_joints", "level": 1, "joint_offsets_rad": offsets})
 
 
-def draws(axis: RobotAxis, count: int) -> list[RobotPerturbation]:
+def sample_many(axis: RobotAxis, count: int) -> list[RobotPerturbation]:
     return [axis.sample(rng(1, "robot", "demo", variant), MILK, variant) for variant in range(count)]
 
 
@@ -50,25 +50,25 @@ def scene(environment: Environment) -> Scene:
     return Scene(environment.place_fixtures(4), starter_demo(PLATE).init_state)
 
 
-def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
-    drawn = draws(RobotAxis(), 500)
-    assert drawn == draws(RobotAxis(), 500)
-    assert {p.level for p in drawn} == {1, 2, 3, 4, 5}
-    for p in drawn:
+def test_perturbations_depend_on_their_key_and_are_as_large_as_their_level() -> None:
+    perturbations = sample_many(RobotAxis(), 500)
+    assert perturbations == sample_many(RobotAxis(), 500)
+    assert {p.level for p in perturbations} == {1, 2, 3, 4, 5}
+    for p in perturbations:
         # The arm is put nearer than the controller pulls it: there it is at rest, and not on its way.
         norm_rad = 0.1 * p.level if p.component == "controller_posture" else 0.02 + 0.04 * p.level
         assert np.linalg.norm(p.joint_offsets_rad) == pytest.approx(norm_rad, abs=3e-6)
-    assert RobotPerturbation.model_validate_json(drawn[0].model_dump_json()) == drawn[0]
+    assert RobotPerturbation.model_validate_json(perturbations[0].model_dump_json()) == perturbations[0]
 
 
 def test_three_of_four_are_what_the_benchmark_does_and_options_choose_otherwise() -> None:
-    shares = {p.component: 0.0 for p in draws(RobotAxis(), 2000)}
-    for p in draws(RobotAxis(), 2000):
+    shares = {p.component: 0.0 for p in sample_many(RobotAxis(), 2000)}
+    for p in sample_many(RobotAxis(), 2000):
         shares[p.component] += 1 / 2000
     assert shares == pytest.approx({"controller_posture": 0.75, "initial_joints": 0.25}, abs=0.03)
     wider = RobotAxis(components=("initial_joints",), initial_norm_rad=(0.1, 0.2, 0.3, 0.4, 0.5), levels=(5,))
-    assert {p.component for p in draws(wider, 20)} == {"initial_joints"}
-    assert np.linalg.norm(draws(wider, 1)[0].joint_offsets_rad) == pytest.approx(0.5, abs=3e-6)
+    assert {p.component for p in sample_many(wider, 20)} == {"initial_joints"}
+    assert np.linalg.norm(sample_many(wider, 1)[0].joint_offsets_rad) == pytest.approx(0.5, abs=3e-6)
 
 
 @pytest.mark.slow
@@ -80,7 +80,7 @@ def test_nine_of_ten_initial_joints_start_within_10_cm(environment: Environment)
     unchanged_m = environment.hand[0]
     away_m: dict[int, list[float]] = {level: [] for level in (1, 2, 3, 4, 5)}
     axis = RobotAxis(components=("initial_joints",))
-    for p in draws(axis, 40):
+    for p in sample_many(axis, 40):
         with suppress(RejectedError):
             environment.restore(p.apply(start, starter_demo(PLATE), roll_out))
             environment.settle(10)
@@ -93,8 +93,8 @@ def test_nine_of_ten_initial_joints_start_within_10_cm(environment: Environment)
 
 def test_no_direction_is_preferred() -> None:
     norms_rad = {"controller_posture": RobotAxis().norm_rad, "initial_joints": RobotAxis().initial_norm_rad}
-    drawn = draws(RobotAxis(), 3000)
-    directions = np.array([np.array(p.joint_offsets_rad) / norms_rad[p.component][p.level - 1] for p in drawn])
+    perturbations = sample_many(RobotAxis(), 3000)
+    directions = np.array([np.array(p.joint_offsets_rad) / norms_rad[p.component][p.level - 1] for p in perturbations])
     assert np.abs(directions.mean(axis=0)).max() < 0.04
     assert np.allclose(np.cov(directions.T), np.eye(7) / 7, atol=0.02)
 
@@ -104,25 +104,25 @@ def test_the_benchmarks_offsets_are_reproduced() -> None:
         assert np.allclose(HOME_RAD + benchmark_offsets_rad()[number - 1], posture, rtol=0, atol=1e-8)
 
 
-def test_every_test_offset_is_found_and_draws_are_clear() -> None:
+def test_every_test_offset_is_found_and_perturbations_keep_their_clearance() -> None:
     for offsets in benchmark_offsets_rad():
         near = turned(*offsets).nearest(TEST, PLATE)
         assert near.distance < 1e-12
         assert near.compared == 3
-    clear = [p.nearest(TEST, PLATE).distance >= p.clearance for p in draws(RobotAxis(), 1000)]
+    clear = [p.nearest(TEST, PLATE).distance >= p.clearance for p in sample_many(RobotAxis(), 1000)]
     assert np.mean(clear) > 0.99
     assert turned(*[0.1] * 7).nearest(TestSet(()), PLATE) == (np.inf, 0)
 
 
 def test_only_the_arm_changes(scene: Scene) -> None:
-    drawn = RobotAxis(levels=(3,), components=("initial_joints",)).sample(rng("some"), PLATE, 0)
-    moved = drawn.apply(scene, starter_demo(PLATE), roll_out)
+    perturbation = RobotAxis(levels=(3,), components=("initial_joints",)).sample(rng("some"), PLATE, 0)
+    moved = perturbation.apply(scene, starter_demo(PLATE), roll_out)
     assert moved.model_xml == scene.model_xml
     compiled = CompiledScene(scene)
     arm = [1 + compiled.model.joint(f"robot0_joint{n}").qposadr[0] for n in range(1, 8)]
     speeds = [1 + compiled.model.nq + compiled.model.joint(f"robot0_joint{n}").dofadr[0] for n in range(1, 8)]
     expected = scene.state.copy()
-    expected[arm] += drawn.joint_offsets_rad
+    expected[arm] += perturbation.joint_offsets_rad
     expected[speeds] = 0.0
     assert np.array_equal(moved.state, expected)
     assert moved.resolved == {"robot": {"joints_rad": expected[arm].tolist()}}
@@ -133,7 +133,7 @@ def recorded_rad(scene: Scene) -> Floats:
     return np.array([compiled.data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)])
 
 
-def test_what_cannot_be_is_refused(scene: Scene) -> None:
+def test_impossible_perturbations_are_rejected(scene: Scene) -> None:
     demo = starter_demo(PLATE)
     start = recorded_rad(scene)
     # The Panda's last joint ends at 2.8973 rad on both sides.
@@ -147,7 +147,7 @@ def test_what_cannot_be_is_refused(scene: Scene) -> None:
             turned(*offsets).apply(scene, demo, roll_out)
 
 
-def drawn_away(libero: Environment, posture_rad: Floats) -> tuple[Floats, Floats, Floats]:
+def pulled_away(libero: Environment, posture_rad: Floats) -> tuple[Floats, Floats, Floats]:
     """What LIBERO's own environment does where its reset has another posture, an initial state is put in and settles.
 
     Returns:
@@ -165,11 +165,11 @@ def drawn_away(libero: Environment, posture_rad: Floats) -> tuple[Floats, Floats
     return reached, before, libero.state
 
 
-def test_a_controllers_posture_draws_the_arm_as_in_the_benchmark() -> None:
+def test_a_controllers_posture_pulls_the_arm_as_in_the_benchmark() -> None:
     """The benchmark's robot tasks change the posture of LIBERO's reset, and put an initial state in after it."""
     libero = Environment(PLATE)
     offset = np.array([0.2, -0.1, 0.15, 0.2, -0.25, 0.1, 0.2])
-    posture_rad, before, expected = drawn_away(libero, HOME_RAD + offset)
+    posture_rad, before, expected = pulled_away(libero, HOME_RAD + offset)
     model_xml = libero.sim.model.get_xml()
     start_rad = before[1:8]
     assert np.linalg.norm(start_rad - HOME_RAD) < 0.15, "the state puts the arm back"
@@ -182,7 +182,7 @@ def test_a_controllers_posture_draws_the_arm_as_in_the_benchmark() -> None:
     assert np.array_equal(scene.state, before)
     ours.restore(scene)
     ours.settle(10)
-    assert np.abs(expected[1:8] - start_rad).max() > 0.1, "the arm is drawn away"
+    assert np.abs(expected[1:8] - start_rad).max() > 0.1, "the arm is pulled away"
     assert np.allclose(ours.state, expected, rtol=0, atol=1e-5)
     goal = ours._env.env.robots[0].controller.goal_ori
     assert np.allclose(goal, libero._env.env.robots[0].controller.goal_ori, rtol=0, atol=1e-6)
@@ -197,10 +197,10 @@ def test_the_replay_starts_there(environment: Environment) -> None:
     """Unlike the benchmark's own offsets, which the state that is put in undoes."""
     demo = starter_demo(PLATE)
     short = replace(demo, actions=demo.actions[:3])
-    drawn = RobotAxis(levels=(5,), components=("initial_joints",)).sample(rng("another"), PLATE, 0)
-    clean, moved = (replay(environment, short, "t", ReplayConfig(), changes) for changes in ((), (drawn,)))
+    perturbation = RobotAxis(levels=(5,), components=("initial_joints",)).sample(rng("another"), PLATE, 0)
+    clean, moved = (replay(environment, short, "t", ReplayConfig(), changes) for changes in ((), (perturbation,)))
     starts = [recorded_rad(t.scene) for t in (clean, moved)]
-    assert np.allclose(starts[1] - starts[0], drawn.joint_offsets_rad, rtol=0, atol=1e-9)
+    assert np.allclose(starts[1] - starts[0], perturbation.joint_offsets_rad, rtol=0, atol=1e-9)
     looks = [recorded_rad(Scene(t.model_xml, t.states[0])) for t in (clean, moved)]
     assert np.linalg.norm(looks[1] - starts[1]) < 0.02, "it stays there while the scene settles"
     assert len(moved.states) == len(clean.states)

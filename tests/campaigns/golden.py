@@ -62,9 +62,9 @@ class Golden:
                 config = ReplayConfig(mode="tracked" if case == "robot" else "open_loop")
                 replays[case] = replay(environment, demo, case, config, physics, lambda: reference)
         environment.close()
-        refused = [case for case, trajectory in replays.items() if not len(trajectory.actions)]
-        if refused:
-            raise ValueError(f"refused in this scene, so they show nothing: {refused}")
+        rejected = [case for case, trajectory in replays.items() if not len(trajectory.actions)]
+        if rejected:
+            raise ValueError(f"rejected in this scene, so they show nothing: {rejected}")
         return replays
 
     @cached_property

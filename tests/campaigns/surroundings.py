@@ -49,24 +49,24 @@ def main() -> None:
             done = stage(undisturbed, name, *WITHOUT_NETWORK)
             if done.returncode:
                 faults.append(f"{name} needs a network: {done.stderr[-300:]}")
-        refused: Counter[str] = Counter()
+        rejected: Counter[str] = Counter()
         with small_disk(disturbed / "data" / "tiny") as disk:
             for name in STAGES:
                 remount(disk, "ro")
                 faults += unlike_a_message(name, stage(disturbed, name), "file system is read-only")
-                refused["read_only"] += 1
+                rejected["read_only"] += 1
                 remount(disk, "rw")
                 while (done := stage(disturbed, name)).returncode:
                     unlike = unlike_a_message(name, done, "disk is full")
                     if unlike:
                         raise SystemExit("\n".join([*faults, *unlike]))
-                    refused[f"full_in_{name}"] += 1
+                    rejected[f"full_in_{name}"] += 1
                     grow(disk)
             faults += compared(undisturbed, disturbed)
             faults += remade_by_another_clock(disturbed)
     for fault in faults:
         print(fault)
-    figures: dict[str, Any] = {"stages_without_network": len(STAGES), **refused, "faults": len(faults)}
+    figures: dict[str, Any] = {"stages_without_network": len(STAGES), **rejected, "faults": len(faults)}
     print(json.dumps(figures))
     raise SystemExit(bool(faults))
 

@@ -1,4 +1,4 @@
-"""Damaged and hostile files are refused with words; `python tests/campaigns/fuzz.py` tries a thousand."""
+"""Damaged and hostile files are rejected with words; `python tests/campaigns/fuzz.py` tries a thousand."""
 
 import random
 
@@ -9,7 +9,7 @@ KINDS_A_DAY, CASES = 4, 40
 
 
 @pytest.mark.slow
-def test_damaged_files_are_refused_or_harmless() -> None:
+def test_damaged_files_are_rejected_or_harmless() -> None:
     seed = 15
     kinds = random.Random(seed).sample(sorted(KINDS), KINDS_A_DAY)
     outcomes, faults = check(kinds, CASES, seed)

@@ -238,7 +238,7 @@ def test_the_meshes_of_an_mjcf_model_are_no_objects(folder: Path, tmp_path: Path
 
 @pytest.mark.parametrize("damage", ["missing", "no image", "cut short"])
 @pytest.mark.parametrize("model", ["house.obj", "label.xml"])
-def test_a_model_without_its_picture_is_refused(folder: Path, tmp_path: Path, model: str, damage: str) -> None:
+def test_a_model_without_its_picture_is_rejected(folder: Path, tmp_path: Path, model: str, damage: str) -> None:
     mine = tmp_path / "mine" / "toy_house"
     write_house(mine, scale=0.01)
     if model == "label.xml":
@@ -281,7 +281,7 @@ def test_a_user_s_mjcf_is_taken_with_its_files(folder: Path, tmp_path: Path) -> 
     )
     (cube,) = models(own(tmp_path / "mine")).values()
     assert cube.shape.volume_m3 == pytest.approx(0.04 * 0.06 * 0.08)
-    assert (compiled(cube).geom_group == 1).any(), "what is touched is also seen when the model draws nothing else"
+    assert (compiled(cube).geom_group == 1).any(), "what is touched is also seen when the model shows nothing else"
 
 
 LABELLED = """<mujoco>
@@ -349,7 +349,7 @@ def test_a_user_s_mjcf_shows_what_mujoco_s_viewer_shows_of_it(folder: Path, tmp_
     ],
     ids=["outside", "texture", "compiler", "hfield"],
 )
-def test_what_would_be_left_out_of_a_model_is_refused_by_name(model: str, named: str, tmp_path: Path) -> None:
+def test_parts_that_would_be_left_out_of_a_model_are_rejected_by_name(model: str, named: str, tmp_path: Path) -> None:
     file = tmp_path / "model.xml"
     file.write_text(f"<mujoco>{model}</mujoco>")
     with pytest.raises(PipelineError, match=re.escape(named)):
@@ -367,7 +367,7 @@ def test_what_would_be_left_out_of_a_model_is_refused_by_name(model: str, named:
         '<frame quat="0 1 0 0"><geom size=".1"/></frame>',
     ],
 )
-def test_models_that_would_change_their_meaning_are_refused(geom: str, tmp_path: Path) -> None:
+def test_models_that_would_change_their_meaning_are_rejected(geom: str, tmp_path: Path) -> None:
     file = tmp_path / "model.xml"
     file.write_text(f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>")
     mujoco.MjModel.from_xml_path(str(file))
@@ -409,8 +409,10 @@ def test_a_configuration_can_name_a_folder(folder: Path, tmp_path: Path) -> None
     write_house(tmp_path / "mine" / "toy_house", scale=0.01)
     sources = ["libero", {"folder": str(tmp_path / "mine"), "licence": "CC0-1.0", "author": "Jane Doe"}]
     axis = LayoutAxis.model_validate({"levels": [1], "sources": sources})
-    drawn = [axis.sample(rng("own", key), find_task("libero_goal", "turn_on_the_stove"), 0) for key in range(300)]
-    (added,) = {one.objects[0] for one in drawn if one.objects[0].category == "toy_house"}
+    perturbations = [
+        axis.sample(rng("own", key), find_task("libero_goal", "turn_on_the_stove"), 0) for key in range(300)
+    ]
+    (added,) = {one.objects[0] for one in perturbations if one.objects[0].category == "toy_house"}
     assert (added.licence, added.attribution) == ("CC0-1.0", "toy_house/house.obj by Jane Doe")
 
 

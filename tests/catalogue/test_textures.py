@@ -23,7 +23,7 @@ from pipeline.catalogue import procedural, texture_sources, textures
 from pipeline.catalogue.downloads import Wheel
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.texture_sources import Package, Texture, from_file
-from pipeline.catalogue.textures import catalogue, find, pixels, refusal
+from pipeline.catalogue.textures import catalogue, find, pixels, why_rejected
 from pipeline.errors import PipelineError
 from pipeline.seeding import rng
 
@@ -114,14 +114,14 @@ def test_data_maps_look_like_what_they_are_named_after() -> None:
         assert cv2.resize(procedural.texture("reflection", index), (32, 32), interpolation=cv2.INTER_AREA).std() < 30
 
 
-def test_test_images_are_refused_by_content_and_name_and_data_maps_by_name() -> None:
+def test_test_images_are_rejected_by_content_and_name_and_data_maps_by_name() -> None:
     used = (LIBERO / "light-gray-plaster.png").read_bytes()
-    assert "bytes" in str(refusal("mine.png", hashlib.sha256(used).hexdigest()))
-    assert "name" in str(refusal("folder:somewhere/Gray-Plaster.JPG", "0" * 64))
+    assert "bytes" in str(why_rejected("mine.png", hashlib.sha256(used).hexdigest()))
+    assert "name" in str(why_rejected("folder:somewhere/Gray-Plaster.JPG", "0" * 64))
     for name in ("Bricks02_NRM_6K.png", "Wood_DISP.png", "metal-roughness.jpg", "CliffDesert006_AO_HIRES.png"):
-        assert "colour" in str(refusal(name, "0" * 64))
+        assert "colour" in str(why_rejected(name, "0" * 64))
     for name in ("Bricks02_COL_6K.png", "normandy_stone.png", "special-oak.png"):
-        assert refusal(name, "0" * 64) is None
+        assert why_rejected(name, "0" * 64) is None
 
 
 def test_a_folder_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,11 +136,11 @@ def test_a_folder_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert texture.load()[0, 0].tolist() == [200, 20, 10]
     # A name that every machine may know, and that two images of one name do not share.
     assert texture.name == f"folder:{texture.sha256[:8]}/wood/oak_COL.png"
-    # What was drawn is shown, whatever becomes of the folder.
+    # What was sampled is shown, whatever becomes of the folder.
     sources = (Folder(folder=folder, licence="CC-BY-4.0", author="Jane Doe"),)
-    drawn = BackgroundAxis(sources=sources).sample(rng("oak"), STOVE, 0)
-    assert drawn.credits(STOVE) == {Credit(texture.name, "texture", "CC-BY-4.0", "Jane Doe")}
-    assert from_json(to_json([drawn])) == (drawn,)
+    perturbation = BackgroundAxis(sources=sources).sample(rng("oak"), STOVE, 0)
+    assert perturbation.credits(STOVE) == {Credit(texture.name, "texture", "CC-BY-4.0", "Jane Doe")}
+    assert from_json(to_json([perturbation])) == (perturbation,)
     oak.unlink()
     assert pixels(texture.name, texture.sha256)[0, 0].tolist() == [200, 20, 10]
     with pytest.raises(PipelineError, match=r"oak_COL.png is missing(?s:.*)python stages/plan.py CONFIG"):

@@ -1,4 +1,4 @@
-"""How often a client draws a step, by the command, weights and words that ``finetune.yaml`` gives."""
+"""How often a client samples a step, by the command, weights and words that ``finetune.yaml`` gives."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from pipeline.clients.recipe import write
 from pipeline.export_config import ExportConfig
 
 
-def test_starvla_draws_every_step_equally_often(tmp_path: Path) -> None:
+def test_starvla_samples_every_step_equally_often(tmp_path: Path) -> None:
     """By its own rule (``LeRobotMixtureDataset``, 0ed0aad): a set, an episode of it, a step of that."""
     export = export_config(lerobot_v21={"name": "tiny", "convention": "ipec"})
     words = tiny_recipe(tmp_path, export)["clients"]["starvla"]["command"].split()
@@ -25,13 +25,13 @@ def test_starvla_draws_every_step_equally_often(tmp_path: Path) -> None:
     of_sets = np.ones(2)
     if given.get("balance_dataset_weights", False):
         of_sets *= [lengths.sum() for lengths in sets]
-    drawn = []
+    probabilities = []
     for share, lengths in zip(of_sets / of_sets.sum(), sets, strict=True):
         of_episodes = np.ones(len(lengths))
         if given.get("balance_trajectory_weights", False):
             of_episodes *= lengths
-        drawn += list(share * of_episodes / of_episodes.sum() / lengths)
-    np.testing.assert_allclose(drawn, 1 / 1000, rtol=1e-12)
+        probabilities += list(share * of_episodes / of_episodes.sum() / lengths)
+    np.testing.assert_allclose(probabilities, 1 / 1000, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("split", "about"), [("train", False), ("val", True)])

@@ -1,4 +1,4 @@
-"""LIBERO's sets beside ours in OpenVLA-OFT: what training makes of an action, evaluation turns back into it.
+"""LIBERO's sets next to ours in OpenVLA-OFT: what training makes of an action, evaluation turns back into it.
 
 A stand-in normalises, weighs and looks statistics up as OpenVLA-OFT does (213c5ff). PyTorch, which is only handed an
 optimiser, is one too: the real one takes seconds to import.
@@ -67,9 +67,9 @@ from {RLDS.replace("/", ".")}.utils.data_utils import save_dataset_statistics
 given = dict(zip(sys.argv[1::2], sys.argv[2::2]))
 mixture = dict(OXE_NAMED_MIXTURES[given["--dataset_name"]])
 made = {{name: make_dataset_from_rlds(name, given["--data_root_dir"]) for name in mixture}}
-drawn = {{name: weight * made[name][0]["num_transitions"] for name, weight in mixture.items()}}
+sampled = {{name: weight * made[name][0]["num_transitions"] for name, weight in mixture.items()}}
 save_dataset_statistics({{name: found for name, (found, _) in made.items()}}, Path("."))
-seen = {{"drawn": drawn, "normalised": {{name: values.tolist() for name, (_, values) in made.items()}}}}
+seen = {{"sampled": sampled, "normalised": {{name: values.tolist() for name, (_, values) in made.items()}}}}
 Path("seen.json").write_text(json.dumps(seen))
 """,
 }
@@ -127,7 +127,7 @@ def test_evaluation_undoes_what_training_did_to_each_set(tmp_path: Path) -> None
     assert set(seen["normalised"]) == set(ACTIONS)
     for name, values in seen["normalised"].items():
         np.testing.assert_allclose(evaluated(values, suite_of(name), statistics), ACTIONS[name], atol=1e-12)
-    assert seen["drawn"] == {
+    assert seen["sampled"] == {
         "libero_mine_goal": 40,
         "libero_mine_spatial": 30,
         "libero_goal_no_noops": 50,
@@ -149,6 +149,6 @@ def test_one_suite_is_mixed_under_the_statistics_of_a_checkpoint(tmp_path: Path)
 
 
 @pytest.mark.parametrize("text", ["libero_goal_no_noops", "libero_10_no_noops=0", "libero_10_no_noops=-1", "bridge=1"])
-def test_a_set_without_a_weight_or_of_another_kind_is_refused(text: str) -> None:
+def test_a_set_without_a_weight_or_of_another_kind_is_rejected(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected a set of LIBERO and a weight"):
         mixed(text)

@@ -167,7 +167,7 @@ def test_recipe_changes_with_the_dataset(tmp_path: Path) -> None:
         ("dataset", "extra", {"value": 1, "source": "x"}),
     ],
 )
-def test_schema_refuses(section: str, field: str, value: object, tmp_path: Path) -> None:
+def test_the_schema_rejects_wrong_values(section: str, field: str, value: object, tmp_path: Path) -> None:
     schema, recipe = json.loads(schema_file("finetune.json").read_text()), tiny_recipe(tmp_path)
     jsonschema.validate(recipe, schema)
     recipe[section] = recipe[section] | {field: value}
@@ -271,7 +271,7 @@ def test_starvla_finds_the_sets_of_every_suite(tmp_path: Path) -> None:
 
 
 def test_gr00t_leaves_the_statistics_of_a_set_as_they_are(tmp_path: Path) -> None:
-    """As ``check_stats_validity`` in its ``gr00t/data/stats.py`` (23ace64) asks; else it writes them anew."""
+    """As ``check_stats_validity`` in its ``gr00t/data/stats.py`` (23ace64) asks; else it writes them again."""
     root = write_lerobot_v21(tmp_path, "ipec").root / SET
     info, stats = (json.loads((root / "meta" / name).read_text()) for name in ("info.json", "stats.json"))
     numbers = [name for name, of in info["features"].items() if "float" in of["dtype"]]

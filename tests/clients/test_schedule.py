@@ -36,19 +36,19 @@ def test_the_rate_follows_steps_warm_up_and_resumption(
 
 def test_a_checkpoint_of_another_training_begins_a_schedule_of_its_own() -> None:
     words = ["--resume", "True", "--resume_step", "150_000", "--max_steps", "170_000"]
-    schedule = read_schedule(words, steps=100_000, warmup_steps=1000, anew=True)
+    schedule = read_schedule(words, steps=100_000, warmup_steps=1000, restart=True)
     shares = {step: schedule.share(step) for step in (0, 199, 200, 10_100, 20_000)}
     assert shares == pytest.approx({0: 1 / 200, 199: 1, 200: 1, 10_100: 0.5, 20_000: 0})
 
 
 @pytest.mark.parametrize(
-    ("words", "anew", "said"),
+    ("words", "restart", "said"),
     [
         (["--resume", "True", "--resume_step", "150000"], False, "--max_steps 250000 for 100000 more"),
         (["--resume", "True", "--resume_step", "150000"], True, "150000 is not below --max_steps 100000"),
         (["--resume_step", "150000", "--max_steps", "170000"], True, "--statistics without --resume"),
     ],
 )
-def test_a_resumption_that_would_train_something_else_is_refused(words: list[str], anew: bool, said: str) -> None:
+def test_a_resumption_that_would_train_something_else_is_rejected(words: list[str], restart: bool, said: str) -> None:
     with pytest.raises(SystemExit, match=said):
-        read_schedule(words, steps=100_000, warmup_steps=1000, anew=anew)
+        read_schedule(words, steps=100_000, warmup_steps=1000, restart=restart)

@@ -1,4 +1,4 @@
-"""A command ends with words and a status, whatever the machine refuses."""
+"""A command ends with words and a status, whatever the machine rejects."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ from pipeline.exit_status import SURROUNDINGS, exit_status
 
 
 @pytest.mark.parametrize("number", SURROUNDINGS)
-def test_what_the_machine_refuses_is_said_with_a_remedy(number: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_faults_of_the_machine_are_reported_with_a_remedy(number: int, capsys: pytest.CaptureFixture[str]) -> None:
     def command() -> int:
         raise OSError(number, os.strerror(number), "data/starter/plan.parquet")
 
@@ -28,15 +28,15 @@ def test_what_the_machine_refuses_is_said_with_a_remedy(number: int, capsys: pyt
 
 
 def test_errors_of_ones_own_and_faults_of_the_code(capsys: pytest.CaptureFixture[str]) -> None:
-    def refused() -> int:
-        raise PipelineError("refused", remedy="ask again")
+    def reject() -> int:
+        raise PipelineError("rejected", remedy="ask again")
 
     def faulty() -> int:
         raise OSError(errno.EBADF, "closed")
 
     assert exit_status(lambda: 3) == 3
-    assert exit_status(refused) == 1
-    assert capsys.readouterr().err == "error: refused\n  try: ask again\n"
+    assert exit_status(reject) == 1
+    assert capsys.readouterr().err == "error: rejected\n  try: ask again\n"
     with pytest.raises(OSError, match="closed"):
         exit_status(faulty)
 

@@ -21,9 +21,9 @@ def process(_: int) -> int:
     return os.getpid()
 
 
-def refuse(number: int) -> int:
+def reject_two(number: int) -> int:
     if number == 2:
-        raise PipelineError("two is refused", where="item 2", expected="another number", remedy="leave it out")
+        raise PipelineError("two is rejected", where="item 2", expected="another number", remedy="leave it out")
     return number
 
 

@@ -1,4 +1,4 @@
-"""Workers of a cluster that was started elsewhere: the same bytes, nothing of an earlier run, or a clear refusal."""
+"""Workers of a cluster that was started elsewhere: the same bytes, nothing of an earlier run, or a clear rejection."""
 
 import os
 import re
@@ -138,7 +138,7 @@ def test_two_runs_on_one_cluster_are_what_they_are_without_it(
 
 
 @pytest.mark.slow
-def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(cluster: Start, tmp_path: Path) -> None:
+def test_workers_that_cannot_work_for_the_run_are_rejected_before_they_start(cluster: Start, tmp_path: Path) -> None:
     edited = tmp_path / "edited"
     for name in ("pipeline", "schemas"):
         shutil.copytree(REPOSITORY / name, edited / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -172,7 +172,7 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
 
 
 @pytest.mark.slow
-def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path) -> None:
+def test_a_worker_with_another_device_is_rejected(cluster: Start, tmp_path: Path) -> None:
     # The device's name tells the width of its vectors.
     address = cluster((1, {"MUJOCO_GL": "osmesa", "LP_NATIVE_VECTOR_WIDTH": "128"}))
     device = gl.choose().device

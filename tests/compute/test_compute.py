@@ -13,7 +13,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from compute_work import BLOCK_BYTES, die, die_or_hang, gpu, mark, pages_asked_for, process, refuse, square
+from compute_work import BLOCK_BYTES, die, die_or_hang, gpu, mark, pages_asked_for, process, reject_two, square
 from conftest import REPOSITORY
 from distributed import Nanny
 
@@ -32,8 +32,8 @@ def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
         workers = set(run(process, numbers, "processes"))
         assert len(workers) == 2
         assert os.getpid() not in workers
-        with pytest.raises(PipelineError, match="item 2: two is refused") as caught:
-            run(refuse, numbers, "refusals")
+        with pytest.raises(PipelineError, match="item 2: two is rejected") as caught:
+            run(reject_two, numbers, "rejections")
         assert caught.value.remedy == "leave it out"
 
         from distributed import get_client
@@ -48,7 +48,7 @@ def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
 def test_a_worker_keeps_the_memory_that_it_frees(tmp_path: Path) -> None:
     with runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run:
         (pages,) = run(pages_asked_for, [100], "pages")
-    assert pages < 10 * BLOCK_BYTES // resource.getpagesize(), "not anew each time"
+    assert pages < 10 * BLOCK_BYTES // resource.getpagesize(), "not each time"
 
 
 @pytest.mark.slow
@@ -110,9 +110,9 @@ def test_workers_that_die_while_they_start_are_started_again(deaths: int, tmp_pa
 
     killer = threading.Thread(target=kill_the_first_of_each_start, daemon=True)
     killer.start()
-    refused = pytest.raises(PipelineError, match=f"{TRIES} times(?s:.*)reduce compute.workers")
+    failure = pytest.raises(PipelineError, match=f"{TRIES} times(?s:.*)reduce compute.workers")
     with (
-        nullcontext() if deaths < TRIES else refused,
+        nullcontext() if deaths < TRIES else failure,
         runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run,
     ):
         assert run(square, [3], "squares") == [9]

@@ -110,7 +110,7 @@ def test_the_work_is_done_by_jobs_of_slurm_and_again_where_one_is_ended(slurm: P
 
 
 @pytest.mark.slow
-def test_what_slurm_refuses_is_said_in_its_words(slurm: Path, tmp_path: Path) -> None:
+def test_rejections_by_slurm_are_reported_in_its_words(slurm: Path, tmp_path: Path) -> None:
     compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(partition="nowhere"))
     with pytest.raises(PipelineError, match="invalid partition") as caught, runner(compute, tmp_path / "data") as work:
         work(job_of, [0], "none")
@@ -202,6 +202,6 @@ def test_a_job_has_the_memory_that_the_stages_were_measured_to_take() -> None:
         ({"cluster": "slurm", "workers": 2, "slurm": {"queue": "cpu"}}, "queue"),
     ],
 )
-def test_a_section_that_does_not_fit_is_refused(compute: dict[str, object], expected: str) -> None:
+def test_a_section_that_does_not_fit_is_rejected(compute: dict[str, object], expected: str) -> None:
     with pytest.raises(ValidationError, match=expected):
         ComputeConfig.model_validate(compute)

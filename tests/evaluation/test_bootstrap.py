@@ -1,4 +1,4 @@
-"""Intervals of paired trials hold what they promise: simulated where the truth is known, and beside SciPy's own."""
+"""Intervals of paired trials hold what they promise: simulated where the truth is known, and next to SciPy's own."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -32,7 +32,7 @@ class Simulated(NamedTuple):
         return interval(bases, list(enumerate(bases)), self.outcomes, statistic)
 
 
-def simulated(draws: np.random.Generator, rates: NDArray[np.float64], trials: Sequence[int]) -> Simulated:
+def simulated(generator: np.random.Generator, rates: NDArray[np.float64], trials: Sequence[int]) -> Simulated:
     """Trials in which the same luck decides 60 % of the outcomes, so that they are paired.
 
     Args:
@@ -40,8 +40,8 @@ def simulated(draws: np.random.Generator, rates: NDArray[np.float64], trials: Se
         trials: of each base task.
     """
     of = np.repeat(np.arange(len(rates)), trials)
-    luck, own = draws.random((len(of), 1)), draws.random((len(of), rates.shape[1]))
-    outcomes = (np.where(draws.random(own.shape) < 0.6, luck, own) < rates[of]).astype(float)
+    luck, own = generator.random((len(of), 1)), generator.random((len(of), rates.shape[1]))
+    outcomes = (np.where(generator.random(own.shape) < 0.6, luck, own) < rates[of]).astype(float)
     return Simulated(of, outcomes)
 
 
@@ -61,11 +61,11 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("effect", [0.0, 0.2])
 def test_of_a_few_fixed_base_tasks_the_interval_covers_their_own_difference(effect: float) -> None:
-    draws = rng("test", "fixed", int(100 * effect))
+    generator = rng("test", "fixed", int(100 * effect))
     first = np.array([0.6, 0.3, 0.6, 0.5])
     rates = np.stack([first, first + effect + np.array([0, 0.2, -0.2, 0])], axis=1)
     found = [
-        simulated(draws, rates, (12, 12, 12, 12)).interval(lambda sums: (sums[:, 1] - sums[:, 0]) / 48)
+        simulated(generator, rates, (12, 12, 12, 12)).interval(lambda sums: (sums[:, 1] - sums[:, 0]) / 48)
         for _ in range(SIMULATIONS)
     ]
     assert found[0].resampled == "48 trials within 4 base tasks"
@@ -76,12 +76,12 @@ def test_of_a_few_fixed_base_tasks_the_interval_covers_their_own_difference(effe
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(("base_tasks", "mean"), [(10, 0.0), (40, 0.1)])
 def test_of_a_sample_of_base_tasks_the_interval_covers_what_others_would_show(base_tasks: int, mean: float) -> None:
-    draws = rng("test", "sample", base_tasks, int(100 * mean))
+    generator = rng("test", "sample", base_tasks, int(100 * mean))
     found = []
     for _ in range(SIMULATIONS):
-        first = draws.choice([0.5, 0.7], base_tasks)
-        second = first + mean + draws.choice([-0.15, 0.0, 0.15], base_tasks)
-        trials = simulated(draws, np.stack([first, second], axis=1), draws.integers(3, 9, base_tasks).tolist())
+        first = generator.choice([0.5, 0.7], base_tasks)
+        second = first + mean + generator.choice([-0.15, 0.0, 0.15], base_tasks)
+        trials = simulated(generator, np.stack([first, second], axis=1), generator.integers(3, 9, base_tasks).tolist())
         outcomes = np.column_stack([trials.outcomes, np.ones(len(trials.outcomes))])
         found.append(trials._replace(outcomes=outcomes).interval(difference))
     assert found[0].resampled == f"{base_tasks} base tasks"
@@ -95,12 +95,12 @@ def gaps(joint_loss: float, base_tasks: int, trials: int, simulations: int) -> t
     Base tasks differ by 4 points in all four rates. Each axis by itself takes 95 % of successes to 90 %; both together
     take ``joint_loss`` more than their product says.
     """
-    draws = rng("test", "gap", base_tasks, trials, int(100 * joint_loss))
+    generator = rng("test", "gap", base_tasks, trials, int(100 * joint_loss))
     rates = np.array([0.95, 0.9, 0.9, 0.9 * 0.9 / 0.95 - joint_loss])
     pairs = []
     for _ in range(simulations):
-        harder = draws.choice([-0.04, 0.04], (base_tasks, 1)) if base_tasks >= statistics.SAMPLE else 0
-        found = simulated(draws, rates + harder + np.zeros((base_tasks, 4)), [trials] * base_tasks)
+        harder = generator.choice([-0.04, 0.04], (base_tasks, 1)) if base_tasks >= statistics.SAMPLE else 0
+        found = simulated(generator, rates + harder + np.zeros((base_tasks, 4)), [trials] * base_tasks)
         neither, one, other, both = found.outcomes.sum(axis=0).astype(int).tolist()
         interval_of_gap = found.interval(gap)
         pairs.append(Pair("robot", "camera", base_tasks * trials, neither, one, other, both, interval_of_gap))
@@ -139,8 +139,8 @@ def test_scipys_bootstrap_gives_the_same_interval_of_independent_trials() -> Non
 
 
 def test_scipys_bootstrap_gives_the_same_interval_of_whole_base_tasks() -> None:
-    draws = rng("test", "scipy", "base tasks")
-    trials = simulated(draws, draws.uniform(0.3, 0.9, (60, 2)), draws.integers(3, 9, 60).tolist())
+    generator = rng("test", "scipy", "base tasks")
+    trials = simulated(generator, generator.uniform(0.3, 0.9, (60, 2)), generator.integers(3, 9, 60).tolist())
     outcomes = np.column_stack([trials.outcomes, np.ones(len(trials.outcomes))])
     ours = trials._replace(outcomes=outcomes).interval(difference)
     first, second, episodes = (np.bincount(trials.base_tasks, column) for column in outcomes.T)
@@ -195,7 +195,7 @@ def test_neither_the_order_of_results_nor_results_that_come_twice_narrow_the_int
     assert compare([pair for pair in pairs for _ in range(3)])["all"]["difference"] == found
 
 
-def test_base_tasks_of_few_trials_are_drawn_as_one() -> None:
+def test_base_tasks_of_few_trials_are_resampled_as_one() -> None:
     alone = [(row(str(at), at % 3 == 0, f"base{at}"), row(str(at), at % 2 == 0, f"base{at}")) for at in range(8)]
     found = compare(alone)["all"]["difference"]
     assert found["resampled"] == "8 trials"

@@ -65,11 +65,11 @@ def pose_of(body: str, scene: Scene) -> Floats:
 
 
 def test_axes_stand_in_the_order_of_their_layers() -> None:
-    drawn = [axis().sample(seeding.rng(1, name), COOKIES, 0) for name, axis in AXES.items()]
-    assert [p.axis for p in drawn] == list(AXES)
-    assert [p.axis for p in drawn][:4] == ["goal", "layout", "pose", "robot"]
-    assert [p.layer for p in drawn] == sorted((p.layer for p in drawn), reverse=True)
-    assert in_order(drawn[::-1]) == from_json(to_json(drawn[::-1])) == tuple(drawn)
+    perturbations = [axis().sample(seeding.rng(1, name), COOKIES, 0) for name, axis in AXES.items()]
+    assert [p.axis for p in perturbations] == list(AXES)
+    assert [p.axis for p in perturbations][:4] == ["goal", "layout", "pose", "robot"]
+    assert [p.layer for p in perturbations] == sorted((p.layer for p in perturbations), reverse=True)
+    assert in_order(perturbations[::-1]) == from_json(to_json(perturbations[::-1])) == tuple(perturbations)
 
 
 def test_the_listed_order_does_not_matter_and_every_change_is_there(base: Scene, crowded: Scene, demo: Demo) -> None:

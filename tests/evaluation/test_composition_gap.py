@@ -1,4 +1,4 @@
-"""The composition gap is the paper's, over trials that have all four combinations of the same draws."""
+"""The composition gap is the paper's, over trials that have all four combinations of the same perturbations."""
 
 import json
 from collections import Counter
@@ -16,7 +16,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import composition
 from pipeline.evaluation.composition import Pair
 from pipeline.evaluation.environment import EpisodeEnvironment
-from pipeline.evaluation.own_draws import draw
+from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.results import EpisodeFiles, stored
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
@@ -43,7 +43,7 @@ def test_the_gap_is_as_worked_by_hand() -> None:
     assert Pair("robot", "camera", 10, 0, 0, 0, 0).figures()["gap"] is None
 
 
-def test_pairs_reuse_the_draws_and_initial_states_of_their_singles() -> None:
+def test_pairs_reuse_the_perturbations_and_initial_states_of_their_singles() -> None:
     tasks = some_pairs(axes=("robot", "camera", "light", "noise"), episodes=5)
     assert Counter(len(task.axis.split("+")) for task in tasks if task.axis != "clean") == {1: 5 * 4, 2: 5 * 6}
     assert sum(task.axis == "clean" for task in tasks) == 5
@@ -52,7 +52,7 @@ def test_pairs_reuse_the_draws_and_initial_states_of_their_singles() -> None:
     for task in tasks:
         for axis in task.axis.split("+") if task.axis != "clean" else ():
             single = singles[axis, task.number]
-            assert draw(task, 0, axis=axis) == draw(single, 0)
+            assert sample_perturbation(task, 0, axis=axis) == sample_perturbation(single, 0)
             assert single.level == task.level
     alone = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot",)))
     assert singles["robot", 0] in alone, "results of held-out perturbations serve pairs too"
@@ -66,7 +66,7 @@ def test_pairs_reuse_the_draws_and_initial_states_of_their_singles() -> None:
 def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tasks = some_pairs(axes=("robot", "noise"), episodes=4)
     for task in tasks:
-        # The last trial lacks its pair, that before it was refused.
+        # The last trial lacks its pair, that before it was rejected.
         if task.axis == "robot+noise" and task.number == 3:
             continue
         ended = {"reason": "refused"} if task.axis == "robot+noise" and task.number == 2 else {}
@@ -90,13 +90,15 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
     assert "several policies" in capsys.readouterr().err
 
 
-def test_the_gap_leaves_out_a_pair_of_other_draws_than_its_singles(tmp_path: Path) -> None:
+def test_the_gap_leaves_out_a_pair_of_other_perturbations_than_its_singles(tmp_path: Path) -> None:
     for task in some_pairs(axes=("robot", "noise"), episodes=2):
         axes = task.axis.split("+") if task.axis != "clean" else ()
-        drawn = json.loads(to_json(draw(task, task.number if len(axes) == 2 else 0, axis=axis) for axis in axes))
-        EpisodeFiles(tmp_path).save(result(task, perturbations=drawn))
+        perturbations = json.loads(
+            to_json(sample_perturbation(task, task.number if len(axes) == 2 else 0, axis=axis) for axis in axes)
+        )
+        EpisodeFiles(tmp_path).save(result(task, perturbations=perturbations))
     (pair,) = composition.pairs(stored([tmp_path]))
-    assert pair.trials == 1, "the second pair was drawn under another seed"
+    assert pair.trials == 1, "the second pair was sampled under another seed"
 
 
 def test_the_gap_counts_no_task_twice(tmp_path: Path) -> None:
@@ -109,7 +111,7 @@ def test_the_gap_counts_no_task_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_pair_composes_what_its_singles_draw() -> None:
+def test_a_pair_composes_the_perturbations_of_its_singles() -> None:
     evaluated = EpisodeEnvironment()
     tasks = {task.axis: task for task in some_pairs(axes=("layout", "robot", "camera"))}
     evaluated.reset(tasks["robot"])

@@ -177,7 +177,7 @@ def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: E
 
 
 @pytest.mark.slow
-def test_moved_scenes_noise_and_held_out_draws_can_be_seen(evaluated: EpisodeEnvironment) -> None:
+def test_moved_scenes_noise_and_held_out_perturbations_can_be_seen(evaluated: EpisodeEnvironment) -> None:
     pictures = {}
     for task in (FIRST, some_test_task("noise", "gaussian_blur"), some_test_task("pose", "pose")):
         evaluated.reset(task)
@@ -211,7 +211,7 @@ def test_noise_changes_the_views_that_it_names(evaluated: EpisodeEnvironment) ->
 
 
 @pytest.mark.slow
-def test_a_scene_whose_first_draw_has_no_place_for_an_object_is_drawn_again(evaluated: EpisodeEnvironment) -> None:
+def test_a_scene_whose_first_sample_has_no_place_for_an_object_is_sampled_again(evaluated: EpisodeEnvironment) -> None:
     name = "pick_up_the_milk_and_place_it_in_the_basket_level4_sample3"
     (crowded,) = select(Selection(source="libero_plus", suites=("libero_object",), tasks=(name,)))
     assert not evaluated.reset(crowded).over
@@ -222,7 +222,7 @@ def test_a_scene_whose_first_draw_has_no_place_for_an_object_is_drawn_again(eval
     ("action", "message"),
     [(np.zeros(6), "shape"), (np.full(7, np.nan), "NaN"), (["left"] * 7, "not numbers")],
 )
-def test_bad_actions_are_refused(evaluated: EpisodeEnvironment, action: Any, message: str) -> None:
+def test_bad_actions_are_rejected(evaluated: EpisodeEnvironment, action: Any, message: str) -> None:
     evaluated.reset(FIRST)
     with pytest.raises(PipelineError, match=message):
         evaluated.step(action)

@@ -20,7 +20,7 @@ from pipeline import identity
 from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
-from pipeline.evaluation import own_draws, results
+from pipeline.evaluation import held_out, results
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, Progress
 from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
 from pipeline.evaluation.policies import Checkpoint, Wanted
@@ -104,7 +104,7 @@ def shorten(folder: Path) -> None:
     ],
     ids=["weights", "processor", "configuration"],
 )
-def test_a_checkpoint_that_changes_where_it_is_is_evaluated_anew(
+def test_a_checkpoint_that_changes_where_it_is_is_evaluated_again(
     tmp_path: Path, taken: list[float], change: Callable[[Path], None], actions: list[float], looks: int
 ) -> None:
     checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
@@ -218,7 +218,7 @@ def test_a_video_shows_what_the_policy_does_not_look_at(
 
 
 @pytest.mark.slow
-def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Path) -> None:
+def test_a_policy_that_samples_random_numbers_samples_them_by_the_task(tmp_path: Path) -> None:
     """So that an episode's result depends neither on those before it nor on the worker. It sees what lerobot's datasets
     hand out: the agent view at its own size, channels first, from 0 to 1."""
     policy = Checkpoint(checkpoints.save_random(tmp_path / "policy"))
@@ -257,7 +257,7 @@ def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     assert job.lost() == {tasks[1]: "worker_lost"}
 
 
-def test_a_perturbation_that_is_drawn_otherwise_now_is_run_again(
+def test_a_perturbation_that_is_sampled_otherwise_now_is_run_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where its name stays; and said once, not for each task."""
@@ -269,7 +269,7 @@ def test_a_perturbation_that_is_drawn_otherwise_now_is_run_again(
     replayed.check(tasks)
     assert all(replayed.result(task) for task in tasks)
     ranges = CameraAxis(spherical=SphericalRange(elevation_deg=((0.0, 1.0),)))
-    monkeypatch.setattr(own_draws, "held_out", lambda _: ranges)
+    monkeypatch.setattr(held_out, "held_out_axis", lambda _: ranges)
     assert select(chosen) == tasks
     changed = sum(replayed.result(task) is None for task in tasks)
     assert 0 < changed < len(tasks), "of one component alone"
@@ -299,7 +299,7 @@ def test_a_folder_has_frames_of_one_device(tmp_path: Path) -> None:
         replayed.check([task])
 
 
-def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
+def test_results_without_an_identity_are_rejected(tmp_path: Path) -> None:
     """As the versions before wrote them."""
     old = {"episode": "a", "source": "libero", "policy": "policy", "settings": {}, "success": True, "reason": "success"}
     file = EpisodeFiles(tmp_path).path("a")
@@ -370,11 +370,11 @@ def test_a_demonstrations_start_is_one_a_task_and_not_every_tasks(tasks: list[Ev
     with pytest.raises(PipelineError, match=told) as caught:
         check_settings(CHOSEN, tasks, settings)
     assert "leave --initial-states out" in str(caught.value)
-    drawn = [replace(libero_task(STOVE, number), source="own", axis="robot") for number in (0, 1)]
-    check_settings(CHOSEN, [libero_task(STOVE, 0), *drawn], settings)
+    held_out_tasks = [replace(libero_task(STOVE, number), source="own", axis="robot") for number in (0, 1)]
+    check_settings(CHOSEN, [libero_task(STOVE, 0), *held_out_tasks], settings)
 
 
-def test_a_list_without_held_out_draws_is_not_kept_clear_of_a_plan(tmp_path: Path) -> None:
+def test_a_list_without_held_out_perturbations_is_not_compared_with_a_plan(tmp_path: Path) -> None:
     plan = tmp_path / "plan.parquet"
     plan.touch()
     with pytest.raises(PipelineError, match="no task has held-out perturbations"):

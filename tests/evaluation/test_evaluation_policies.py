@@ -57,7 +57,7 @@ def test_answers_are_checked_before_any_is_taken() -> None:
             checked_actions(answer, "policy")
 
 
-def test_a_server_of_other_actions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_of_other_actions_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """vla-eval's own server without its weights, with X-VLA's parameters for LIBERO, and with those of LIBERO."""
     monkeypatch.setattr(GR00TModelServer, "_init_policy", lambda self: None)
     with start_blocking_portal() as portal:
@@ -120,14 +120,14 @@ def test_checkpoints_that_pad_missing_images_get_the_two_views(
             cameras_of(smolvla, lost, tmp_path)
 
 
-def test_a_checkpoint_that_needs_another_image_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_that_needs_another_image_is_rejected(tmp_path: Path) -> None:
     act = ACTConfig(input_features=images(image=32, front=32), device="cpu")
     with pytest.raises(PipelineError, match=r"needs the images .*front, which") as found:
         cameras_of(act, {}, tmp_path)
     assert "--rename_map" in str(found.value)
 
 
-def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_refused(
+def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """lerobot 0.6.1's pi0.5 keeps random weights after a failure, as this stand-in does."""

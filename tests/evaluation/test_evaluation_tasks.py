@@ -20,8 +20,8 @@ from pipeline.axes import level_of_test
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
+from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.libero_plus import moved_state, saved_array
-from pipeline.evaluation.own_draws import draw
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import grade, summary, wilson
@@ -77,13 +77,13 @@ def test_a_subset_is_balanced_and_holds_the_smaller_ones() -> None:
     assert balanced(reversed(tasks), 50, seed=0) == chosen != balanced(tasks, 50, seed=1)
 
 
-def test_held_out_draws_are_none_of_a_plan() -> None:
+def test_held_out_perturbations_are_none_of_a_plan() -> None:
     (task, *_) = select(Selection(source="own", axes=("camera",), levels=(3,), suites=("libero_goal",)))
-    assert draw(task, 0) == draw(task, 0) != draw(task, 1)
-    assert draw(task, 0).level == task.level == 3
-    assert draw(task, 0, attempt=1) != draw(task, 0)
+    assert sample_perturbation(task, 0) == sample_perturbation(task, 0) != sample_perturbation(task, 1)
+    assert sample_perturbation(task, 0).level == task.level == 3
+    assert sample_perturbation(task, 0, attempt=1) != sample_perturbation(task, 0)
     others = select(Selection(source="own", axes=("camera",), levels=(3,)))
-    assert len({draw(other, 0) for other in others}) == len(others) == 40, "each task has its own"
+    assert len({sample_perturbation(other, 0) for other in others}) == len(others) == 40, "each task has its own"
     with pytest.raises(PipelineError, match="language"):
         select(Selection(source="own", axes=("language",)))
 
@@ -101,7 +101,7 @@ def test_instructions_are_clean_or_the_benchmarks() -> None:
     assert told("language", "libero_goal", "clean") == told("language", "libero_goal", "benchmark")
 
 
-def test_a_test_task_that_a_suite_does_not_have_is_refused() -> None:
+def test_a_test_task_that_a_suite_does_not_have_is_rejected() -> None:
     (test, *_) = (test for (suite, _), test in benchmark.load().by_name.items() if suite == "libero_goal")
     assert benchmark.load().find("libero_goal", test.name) is test
     with pytest.raises(PipelineError, match="libero_10: LIBERO-Plus has no test task"):
@@ -145,16 +145,16 @@ def test_intervals_are_wilsons() -> None:
         [*rows, result(EvaluationTask("own", "libero_goal", "b", "n", "robot", "c", 1, 0), reason="refused")]
     )
     assert (found["all"]["episodes"], found["refused"]) == (4, 1)
-    assert found["by_axis"].keys() == {"camera", "noise"}, "no policy acted in what was refused"
+    assert found["by_axis"].keys() == {"camera", "noise"}, "no policy acted in what was rejected"
     assert found["by_axis_and_level"].keys() == {"camera/1", "camera/2", "noise/1", "noise/2"}
     assert sum(group["successes"] for group in found["by_axis"].values()) == found["all"]["successes"]
 
 
-def test_a_task_whose_scene_a_model_was_refused_is_not_graded(tmp_path: Path) -> None:
-    acted, refused = select(Selection(suites=(STOVE.suite,)))[:2]
+def test_a_task_whose_scene_was_rejected_for_a_model_is_not_graded(tmp_path: Path) -> None:
+    acted, rejected = select(Selection(suites=(STOVE.suite,)))[:2]
     files = EpisodeFiles(tmp_path)
-    one = [(result(acted, True), files), (result(refused, reason="refused"), files)]
-    graded = grade([one, [(result(task, True, "other"), files) for task in (acted, refused)]])
+    one = [(result(acted, True), files), (result(rejected, reason="refused"), files)]
+    graded = grade([one, [(result(task, True, "other"), files) for task in (acted, rejected)]])
     assert [(task["name"], task["solved"]) for task in graded] == [(acted.name, 2)]
 
 
@@ -252,18 +252,18 @@ def test_tasks_of_unknown_level_are_counted_where_a_level_is_asked_for(capsys: p
         ({"source": "libero_plus", "axes": ("camera",), "components": ("fog",)}, "axes noise; or components distance"),
     ],
 )
-def test_what_nothing_has_is_refused_with_what_there_is(chosen: dict[str, object], told: str) -> None:
+def test_restrictions_without_a_match_are_rejected_with_the_known_values(chosen: dict[str, object], told: str) -> None:
     with pytest.raises(PipelineError) as caught:
         select(Selection.model_validate(chosen))
     assert told in str(caught.value)
 
 
-def test_held_out_draws_can_be_more_than_initial_states() -> None:
+def test_held_out_perturbations_can_be_more_than_initial_states() -> None:
     chosen = {"source": "own", "axes": ("robot",), "levels": (3,), "suites": (STOVE.suite,), "tasks": (STOVE.name,)}
     fifty, more = (select(Selection.model_validate(chosen | {"episodes": count})) for count in (50, 53))
     assert more[:50] == fifty
     assert [task.number for task in more[50:]] == [50, 51, 52]
-    assert len({draw(task, 0).model_dump_json() for task in more}) == 53
+    assert len({sample_perturbation(task, 0).model_dump_json() for task in more}) == 53
 
 
 def test_a_list_of_tasks_is_checked(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tasks are graded as the paper grades them, and a constructed benchmark is balanced and read back as it was drawn."""
+"""Tasks are graded as the paper grades them, and a constructed benchmark is balanced and read back as sampled."""
 
 import json
 from collections import Counter
@@ -12,8 +12,8 @@ from episode_results import analyze, result
 from pipeline.axes import AXES
 from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.errors import PipelineError
-from pipeline.evaluation import own_draws
-from pipeline.evaluation.own_draws import OWN_AXES
+from pipeline.evaluation import held_out
+from pipeline.evaluation.held_out import OWN_AXES
 from pipeline.evaluation.results import EpisodeFiles, read
 from pipeline.evaluation.selection import Selection, candidates, construct, select
 from pipeline.evaluation.statistics import difficulty
@@ -43,7 +43,7 @@ def test_tasks_are_graded_by_the_models_that_solve_them(tmp_path: Path) -> None:
     assert set(select(Selection(file=graded))) == set(tasks[:9])
 
 
-def test_a_graded_task_keeps_its_name_where_another_component_was_drawn(tmp_path: Path) -> None:
+def test_a_graded_task_keeps_its_name_where_another_component_was_sampled(tmp_path: Path) -> None:
     (task,) = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot",), levels=(3,)))
     (other,) = {"controller_posture", "initial_joints"} - {task.component}
     EpisodeFiles(tmp_path).save(result(replace(task, component=other), True))
@@ -75,19 +75,19 @@ def test_grades_count_neither_a_task_nor_a_model_twice(tmp_path: Path, capsys: p
 
 
 @pytest.mark.slow
-def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) -> None:
-    drawn = candidates(seed=3, each=20)
+def test_a_benchmark_is_sampled_filtered_balanced_and_read_back(tmp_path: Path) -> None:
+    sampled = candidates(seed=3, each=20)
     tested = [axis for axis in OWN_AXES if AXES[axis].dimension]
-    assert Counter((task.suite, task.axis) for task in drawn) == {
+    assert Counter((task.suite, task.axis) for task in sampled) == {
         (suite, axis): 20 for suite in Selection().suites for axis in tested
     }
-    assert len(set(drawn)) == len(drawn)
-    refused = [task for task in drawn if task.axis == "layout"][:5]
-    chosen, counts = construct(drawn, 3, 210, [result(task, reason="refused", seed=3) for task in refused])
+    assert len(set(sampled)) == len(sampled)
+    rejected = [task for task in sampled if task.axis == "layout"][:5]
+    chosen, counts = construct(sampled, 3, 210, [result(task, reason="refused", seed=3) for task in rejected])
     assert (counts["candidates"], counts["refused"], counts["overlapping"]) == (560, 5, 0)
     assert set(Counter(task.axis for task in chosen).values()) == {30}
-    assert not set(refused) & set(chosen)
-    assert set(chosen) < set(drawn)
+    assert not set(rejected) & set(chosen)
+    assert set(chosen) < set(sampled)
     file = tmp_path / "tasks.json"
     write_tasks(chosen, 3, file)
     assert select(Selection(file=file, seed=3)) == chosen
@@ -101,13 +101,15 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
         select(Selection(file=file))
 
 
-def test_a_list_is_of_the_draws_that_it_was_made_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("camera",)))
+def test_a_list_of_tasks_that_are_sampled_otherwise_now_is_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasks = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("camera",)))
     file = tmp_path / "tasks.json"
-    write_tasks(drawn, 0, file)
-    assert select(Selection(file=file)) == drawn
+    write_tasks(tasks, 0, file)
+    assert select(Selection(file=file)) == tasks
     ranges = CameraAxis(spherical=SphericalRange(elevation_deg=((0.0, 1.0),)))
-    monkeypatch.setattr(own_draws, "held_out", lambda _: ranges)
+    monkeypatch.setattr(held_out, "held_out_axis", lambda _: ranges)
     with pytest.raises(PipelineError, match="this version samples other perturbations"):
         select(Selection(file=file))
 

@@ -45,7 +45,7 @@ def as_lerobot(env: Any, raw: dict[str, Any]) -> dict[str, Any]:
 
 def liberos(task: Task) -> list[tuple[Any, dict[str, Any]]]:
     """State and observation of LIBERO's own environment after settling and after each action, as lerobot takes them."""
-    # All of them at once: robosuite draws into whichever OpenGL context is current.
+    # All of them at once: robosuite renders into whichever OpenGL context is current.
     env = OffScreenRenderEnv(bddl_file_name=str(task.bddl_file), camera_heights=256, camera_widths=256)
     env.seed(0)
     env.reset()
@@ -141,7 +141,7 @@ def test_options_that_change_the_policy_are_part_of_its_identity(
     both = ["--policy.n_action_steps=5", "--policy.temporal_ensemble_coeff=0.01"]
     assert identity_of(*both) == identity_of(*both[::-1]) == f" {both[0][2:]} {both[1][2:]}"
     assert identity_of("--rename_map={}", size_px=(360, 360)) == " observation=360x360 rename_map={}"
-    # Results of both under one label are refused.
+    # Results of both under one label are rejected.
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoints.save(tmp_path / "act", 0.0)), label="act")
     settings, rows = EpisodeSettings(runner="lerobot-eval"), tmp_path / "rows"
     listed = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))

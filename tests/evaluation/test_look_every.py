@@ -91,7 +91,7 @@ def short() -> Any:
     opened().close()
 
 
-def test_the_harness_refuses_absolute_actions() -> None:
+def test_the_harness_rejects_absolute_actions() -> None:
     with pytest.raises(PipelineError, match="--actions absolute"):
         PerturbedLibero(absolute_action=True)
 

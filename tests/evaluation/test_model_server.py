@@ -215,7 +215,7 @@ def test_the_servers_of_vla_eval_ask_for_the_angles_that_the_warning_names() -> 
     assert [bool(params.get("quat_no_antipodal")) for params in requests.values()] == [False, True, False]
 
 
-def test_angles_for_a_server_without_the_state_are_refused(serve: Serve) -> None:
+def test_angles_for_a_server_without_the_state_are_rejected(serve: Serve) -> None:
     address = serve(Asking(send_wrist_image=True))
     with pytest.raises(PipelineError, match="does not request the state"):
         warn_of_requests(address, timeout_s=10, actions="delta", state_angle="2pi")

@@ -64,12 +64,12 @@ def write_all(out: Path, run: Any = loop) -> Written:
 def write_offline(folder: Path) -> None:
     """Write all sets without a network and without a trace in the cache of ``datasets``."""
 
-    def refuse(*_: object) -> None:
+    def reject(*_: object) -> None:
         raise AssertionError("a writer reached for the network")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets.config, "HF_DATASETS_CACHE", folder / "cache")
-        patch.setattr(socket.socket, "connect", refuse)
+        patch.setattr(socket.socket, "connect", reject)
         write_all(folder / "out")
     assert not (folder / "cache").exists()
     names = ["images", "lerobot", "lerobot.json", "rlds", "rlds.json"]

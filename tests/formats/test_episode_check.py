@@ -1,4 +1,4 @@
-"""What every writer refuses of an episode, in words that name the field, and what was written before stays."""
+"""What every writer rejects of an episode, in words that name the field, and what was written before stays."""
 
 import io
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def as_png(jpeg: bytes) -> bytes:
         (lambda jpeg: jpeg[:-2], "frame 3 is cut short"),
     ],
 )
-def test_a_frame_that_is_no_whole_jpeg_is_refused(change: Callable[[bytes], bytes], message: str) -> None:
+def test_a_frame_that_is_no_whole_jpeg_is_rejected(change: Callable[[bytes], bytes], message: str) -> None:
     whole = episode(IDS[0])
     check(whole)
     frames = list(whole.frames["image"])
@@ -77,7 +77,7 @@ def load_spoilt(episode_id: str, spoil: Callable[[Episode], Episode]) -> Episode
 
 
 @pytest.mark.parametrize("fault", BAD)
-def test_rlds_refuses_a_bad_episode(fault: str, tmp_path: Path) -> None:
+def test_rlds_rejects_a_bad_episode(fault: str, tmp_path: Path) -> None:
     field, spoil = BAD[fault]
     with pytest.raises(PipelineError, match=rf"episode {IDS[-1]}: {field} "):
         write_rlds(tmp_path, load=partial(load_spoilt, spoil=spoil))
@@ -86,7 +86,7 @@ def test_rlds_refuses_a_bad_episode(fault: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_lerobot_refuses_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) -> None:
+def test_lerobot_rejects_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) -> None:
     write_lerobot(tmp_path, frames="images")
     earlier = files(tmp_path / "lerobot")
     field, spoil = BAD["nan"]

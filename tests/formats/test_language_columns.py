@@ -56,7 +56,7 @@ def trace(step: int, steps: int) -> str:
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set whose last two episodes are of the split ``val``."""
-    # Refused when it is read where lerobot is older; the writer asks nothing of lerobot.
+    # Rejected when it is read where lerobot is older; the writer asks nothing of lerobot.
     options = LeRobotConfig(name=NAME, shards=3, validation=0.3).model_copy(update={"language": True})
     target = LeRobot(tmp_path_factory.mktemp("language"), options)
     source = episodes(told)
@@ -111,7 +111,7 @@ def test_every_frame_has_the_rewrites_and_subtasks_of_its_episode(root: Path) ->
         assert [each["content"] for each in wordings] == list(expected)
         assert {(each["role"], each["timestamp"]) for each in wordings} <= {("user", 0.0)}
         motions = [(each["role"], each["content"], each["timestamp"]) for each in said if each["style"] == "motion"]
-        # The hand of every tenth step turns anew, and its fingers close at step 6.
+        # The hand of every tenth step turns again, and its fingers close at step 6.
         assert [round(at_s * 20) for _, _, at_s in motions] == [0, 10][: 1 + (len(source) > 10)]
         assert {role for role, _, _ in motions} == {"assistant"}
         assert motions[0][1].startswith("move forward, ")

@@ -97,7 +97,7 @@ def test_each_suite_of_rlds_must_have_a_validation_split() -> None:
 
 
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.05, 0.07, 0.1, 0.125, 0.15, 0.2, 0.3, 1 / 3, 0.34, 0.35, 0.5])
-def test_as_many_demonstrations_as_a_refusal_asks_for_are_enough_and_one_fewer_is_not(share: float) -> None:
+def test_as_many_demonstrations_as_a_rejection_asks_for_are_enough_and_one_fewer_is_not(share: float) -> None:
     def splits(demonstrations: int) -> dict[str, list[str]]:
         ids = [f"{number}" for number in range(demonstrations)]
         known = {name: EpisodeFacts("libero_goal", demo=f"libero_goal/task/demo_{name}") for name in ids}
@@ -112,18 +112,18 @@ def test_as_many_demonstrations_as_a_refusal_asks_for_are_enough_and_one_fewer_i
 
 
 @pytest.mark.slow
-def test_too_small_a_share_is_refused_before_any_work(short_demos: Path, tmp_path: Path) -> None:
+def test_too_small_a_share_is_rejected_before_any_work(short_demos: Path, tmp_path: Path) -> None:
     """The milk has two demonstrations, the others one. The last share is another than the plan was made with."""
     link_testset(tmp_path)
     file = tmp_path / "tiny.yaml"
-    for stage, share, refused in (("plan", 0.25, True), ("plan", 0.26, False), ("render", 0.25, True)):
+    for stage, share, rejected in (("plan", 0.25, True), ("plan", 0.26, False), ("render", 0.25, True)):
         fields = tiny_config(short_demos)
         fields["export"]["lerobot"]["validation"] = share
         file.write_text(yaml.safe_dump(fields))
         command = [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(file)]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == refused, done.stderr
-        if refused:
+        assert done.returncode == rejected, done.stderr
+        if rejected:
             assert "export.lerobot.validation: no task has enough demonstrations for 0.25 of them" in done.stderr
             assert "3 or more demonstrations of a task" in done.stderr
 

@@ -62,7 +62,7 @@ BAD: dict[str, tuple[Callable[[hdf5.Recording], hdf5.Recording], str, str]] = {
         "has 78 numbers, the scene's has 79",
     ),
     "state without a rotation": (unturned, "state_mismatch", "rotation of length 0"),
-    "model that MuJoCo refuses": (
+    "model that MuJoCo rejects": (
         with_model("<geom ", '<geom colour="red" '),
         "scene_refused",
         "unrecognized attribute",

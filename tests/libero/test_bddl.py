@@ -1,4 +1,4 @@
-"""BDDL files: what the reader says of LIBERO's own, and that it refuses what defines no task."""
+"""BDDL files: what the reader says of LIBERO's own, and that it rejects what defines no task."""
 
 import re
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_every_task_has_the_arena_that_libero_builds(suite: str) -> None:
         assert read.arena == {"table": "tabletop"}.get(built, built), task.name
 
 
-def test_a_scene_of_no_known_arena_is_refused() -> None:
+def test_a_scene_of_no_known_arena_is_rejected() -> None:
     assert bddl.arena("libero_kitchen_tabletop_manipulation_kitchen_table_wood") == "kitchen"
     for problem in ("libero_coffee_table_manipulation", "LIBERO_Kitchen_Tabletop_Manipulation"):
         with pytest.raises(PipelineError, match="arena"):
@@ -73,7 +73,7 @@ def test_every_task_is_read(suite: str) -> None:
         ("(define (problem X) (:language a) (:objects o - k) (:init (On o t)) (:goal (Not (On o t))))", "plain fact"),
     ],
 )
-def test_what_defines_no_task_is_refused_by_name(text: str, fault: str, tmp_path: Path) -> None:
+def test_files_that_define_no_task_are_rejected_by_name(text: str, fault: str, tmp_path: Path) -> None:
     file = tmp_path / "task.bddl"
     file.write_text(text)
     with pytest.raises(PipelineError, match=fault) as caught:
@@ -187,7 +187,7 @@ def test_a_goal_region_moves_only_with_the_thing_that_its_name_says(goal: str, m
     assert own(goal).goal_regions == expected
 
 
-def test_of_two_things_of_a_category_a_region_is_beside_neither() -> None:
+def test_of_two_things_of_a_category_a_region_is_next_to_neither() -> None:
     two = "plate_1 plate_2"
     text = OWN.replace("plate_1{more}", two).replace(
         "(On bowl_1 main_table_bowl", "(On plate_2 main_table_goal) (On bowl_1 main_table_bowl"

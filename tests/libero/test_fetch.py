@@ -220,7 +220,7 @@ def test_an_unreachable_hub_names_the_starter_set(tmp_path: Path, folder_in_use:
     assert REPOSITORY in str(caught.value)
 
 
-def test_unknown_suite_is_refused_before_any_request(hub: Hub, tmp_path: Path) -> None:
+def test_an_unknown_suite_is_rejected_before_any_request(hub: Hub, tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="unknown suite 'libero_kitchen'"):
         fetch(tmp_path, ["libero_goal", "libero_kitchen"], hub.endpoint)
     assert hub.sent == []

@@ -138,7 +138,7 @@ def test_a_gap_and_a_time_that_stands_still_are_accepted(root: Path) -> None:
     assert len(changed(root, change).entries) == 2
 
 
-def test_states_in_single_precision_beside_a_first_state_in_double(root: Path) -> None:
+def test_states_in_single_precision_after_a_first_state_in_double(root: Path) -> None:
     index = changed(root, lambda data: put(data["demo_0"], states=data["demo_0/states"][()].astype(np.float32)))
     assert [entry.key for entry in index.entries] == ["demo_0", "demo_1"]
 

@@ -83,7 +83,7 @@ HOSTILE_DOCUMENTS = {
     [(f"<mujoco>{body}</mujoco>", what) for body, what in HOSTILE.values()] + [*HOSTILE_DOCUMENTS.values()],
     ids=[*HOSTILE, *HOSTILE_DOCUMENTS],
 )
-def test_hostile_models_are_refused(xml: str, what: str) -> None:
+def test_hostile_models_are_rejected(xml: str, what: str) -> None:
     with pytest.raises(PipelineError) as caught:
         relocate(xml, "stove_demo.hdf5 data/demo_0 model_file")
     message = str(caught.value)
@@ -92,7 +92,7 @@ def test_hostile_models_are_refused(xml: str, what: str) -> None:
     assert "root:" not in message
 
 
-def test_a_link_out_of_the_assets_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_out_of_the_assets_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = tmp_path / "assets"
     root.mkdir()
     (tmp_path / "secret.png").touch()

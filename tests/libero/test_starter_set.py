@@ -40,7 +40,7 @@ def test_starter_set_has_every_task() -> None:
         ("libero_none/a/demo_0", "unknown suite"),
     ],
 )
-def test_starter_set_refuses_unknown_ids(demo_id: str, what: str) -> None:
+def test_the_starter_set_rejects_unknown_ids(demo_id: str, what: str) -> None:
     with pytest.raises(PipelineError, match=what):
         StarterSource().load(demo_id)
 

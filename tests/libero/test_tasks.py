@@ -64,7 +64,7 @@ def own_task(folder: Path, language: str = "Put the bowl down") -> Path:
     return file
 
 
-def test_own_tasks_stand_beside_liberos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_tasks_stand_next_to_liberos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     file = own_task(tmp_path / "tasks" / "my_suite")
     assert suites() == (*SUITES, "my_suite")

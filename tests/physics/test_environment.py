@@ -22,11 +22,11 @@ OPEN_DRAWER = find_task(
 ANOTHERS_LOG = """
 import sys
 
-def refuse(event, arguments):
+def reject(event, arguments):
     if event == "open" and arguments[0] == "/tmp/robosuite.log":
         raise PermissionError(arguments[0])
 
-sys.addaudithook(refuse)
+sys.addaudithook(reject)
 from pipeline.physics.control_env import control_env
 control_env()
 """
@@ -77,7 +77,7 @@ def test_another_scene_between_leaves_no_trace(stove: Environment, whole: dict[T
 
 @pytest.mark.slow
 def test_fixtures_stand_the_same_whatever_was_placed_before() -> None:
-    # Its drawer is open at first; LIBERO's own second reset draws more random numbers than the first.
+    # Its drawer is open at first; LIBERO's own second reset samples more random numbers than the first.
     first, second = Environment(OPEN_DRAWER), Environment(OPEN_DRAWER)
     after_another = [first.place_fixtures(seed) for seed in (0, 1)][1]
     assert second.place_fixtures(1) == after_another

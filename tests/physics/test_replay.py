@@ -129,7 +129,7 @@ def test_replay_starts_from_the_recorded_state_and_reaches_the_recorded_goal(
     assert np.allclose(control_step_s, 1 / 20)
 
 
-def test_a_demonstration_that_changed_since_the_plan_is_refused(short_demos: Path, tmp_path: Path) -> None:
+def test_a_demonstration_that_changed_since_the_plan_is_rejected(short_demos: Path, tmp_path: Path) -> None:
     root = tmp_path / "demos"
     shutil.copytree(short_demos / STOVE.suite, root / STOVE.suite)
     demos = DemosConfig(source="hdf5", root=root, tasks=(f"{STOVE.suite}/{STOVE.name}",))
@@ -191,7 +191,7 @@ def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> 
     assert np.random.random_sample() == expected[1], "numpy's global generator is left as it was"
 
 
-def test_state_of_another_scene_is_refused(short_demos: Path, whole: dict[Task, Trajectory]) -> None:
+def test_the_state_of_another_scene_is_rejected(short_demos: Path, whole: dict[Task, Trajectory]) -> None:
     with pytest.raises(PipelineError, match="the recorded state has 79 numbers, the scene's has 110"):
         Environment(MILK).restore(Scene(whole[MILK].model_xml, whole[BOWL].states[0]))
 

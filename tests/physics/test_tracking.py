@@ -165,13 +165,13 @@ def tilted(pose: Floats, angle_rad: float) -> Floats:
     return np.append(pose[:3], (tilt * Rotation.from_quat(pose[3:], scalar_first=True)).as_quat(scalar_first=True))
 
 
-def test_what_has_fallen_over_is_refused_where_the_hand_meets_it(milk: Reference) -> None:
+def test_an_object_that_fell_over_is_rejected_where_the_hand_meets_it(milk: Reference) -> None:
     poses = {name: poses[0] for name, poses in milk.poses.items()}
     with pytest.raises(RejectedError, match="object_not_upright"):
         Route.through(milk, start_of(milk), poses | {"milk_1": tilted(poses["milk_1"], 0.5)})
     Route.through(milk, start_of(milk), poses | {"milk_1": tilted(poses["milk_1"], 0.1)})
-    beside = next(name for name in poses if not milk.held[name].any() and not milk.met[name].any())
-    route = Route.through(milk, start_of(milk), poses | {beside: tilted(poses[beside], 0.5)})
+    untouched = next(name for name in poses if not milk.held[name].any() and not milk.met[name].any())
+    route = Route.through(milk, start_of(milk), poses | {untouched: tilted(poses[untouched], 0.5)})
     assert np.array_equal(route.positions_m, milk.positions_m)
 
 

@@ -79,9 +79,13 @@ def test_no_object_stands_where_a_test_has_it(tmp_path: Path) -> None:
     tests_m, nearest_m = moves_of_tests_m(), []
     assert len(tests_m) > 10
     for row in rows:
-        for drawn in from_json(row.perturbations):
-            assert isinstance(drawn, PosePerturbation)
-            stands_m = starts_m[row.demo_id] - starter_demo(MILK).init_state[X : X + 2] + (drawn.dx_m, drawn.dy_m)
+        for perturbation in from_json(row.perturbations):
+            assert isinstance(perturbation, PosePerturbation)
+            stands_m = (
+                starts_m[row.demo_id]
+                - starter_demo(MILK).init_state[X : X + 2]
+                + (perturbation.dx_m, perturbation.dy_m)
+            )
             nearest_m.append(np.linalg.norm(tests_m - stands_m, axis=1).min())
     assert len(nearest_m) == 600
     assert min(nearest_m) >= PosePerturbation.clearance - 1e-6
@@ -107,10 +111,10 @@ def test_a_reset_of_another_scene_has_none_of_an_expansions_displacements(tmp_pa
     config = PlanConfig.model_validate({"axes": axes, "episodes": {"goal+pose": 40, "pose": 40}, "reserve": 0})
     moved = {"goal+pose": 0, "pose": 0}
     for row in plan.make(entries, config, ReplayConfig(), benchmark.load(FOLDER)):
-        for drawn in from_json(row.perturbations):
-            if isinstance(drawn, PosePerturbation):
+        for perturbation in from_json(row.perturbations):
+            if isinstance(perturbation, PosePerturbation):
                 moved[row.axis] += 1
-                assert (drawn.shifts_in_all == drawn.shifts) == (row.axis == "goal+pose")
+                assert (perturbation.shifts_in_all == perturbation.shifts) == (row.axis == "goal+pose")
     assert moved == {"goal+pose": 40, "pose": 40}
 
 

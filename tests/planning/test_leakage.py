@@ -26,7 +26,7 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis, displacements
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
-from pipeline.evaluation.own_draws import PlannedDraws
+from pipeline.evaluation.held_out import PlannedPerturbations
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
@@ -38,7 +38,7 @@ from pipeline.types import Task
 
 FOLDER = REPOSITORY / benchmark.FOLDER
 
-AS_DRAWN: dict[str, Callable[[TestTask], dict[str, Any]]] = {
+REPEATED: dict[str, Callable[[TestTask], dict[str, Any]]] = {
     "camera": lambda tested: dict(tested.parameters),
     "noise": lambda tested: {
         "effect": {name: value for name, value in tested.parameters.items() if name != "severity"},
@@ -66,8 +66,8 @@ def test() -> TestSet:
 
 
 def repeated(tested: TestTask) -> Perturbation:
-    """The test task as if the planner had drawn it."""
-    fields = {"axis": tested.axis, "component": tested.component, "level": 1, **AS_DRAWN[tested.axis](tested)}
+    """The test task as if the planner had sampled it."""
+    fields = {"axis": tested.axis, "component": tested.component, "level": 1, **REPEATED[tested.axis](tested)}
     (perturbation,) = from_json(json.dumps([fields]))
     return perturbation
 
@@ -100,8 +100,8 @@ def row(task: Task, perturbations: Iterable[Perturbation], name: str) -> Row:
     )
 
 
-@pytest.mark.parametrize("axis", [axis for axis in AXES if axis in AS_DRAWN])
-def test_every_test_task_is_found_when_it_is_drawn(axis: str, test: TestSet) -> None:
+@pytest.mark.parametrize("axis", [axis for axis in AXES if axis in REPEATED])
+def test_every_test_task_is_found_when_it_is_sampled(axis: str, test: TestSet) -> None:
     known = [tested for tested in test.on_axis(axis) if axis != "pose" or "target" in tested.parameters]
     assert len(known) > 600
     rows = [row(find_task(tested.suite, tested.base), [repeated(tested)], f"{n}") for n, tested in enumerate(known)]
@@ -112,7 +112,7 @@ def test_every_test_task_is_found_when_it_is_drawn(axis: str, test: TestSet) -> 
     assert finding.smallest == pytest.approx(0, abs=1e-5)
 
 
-def test_every_test_scene_is_found_when_it_is_drawn(test: TestSet) -> None:
+def test_every_test_scene_is_found_when_it_is_sampled(test: TestSet) -> None:
     """With everything that it moves; and its other moves keep it apart from a scene that only the target's fits."""
     rows = []
     for number, tested in enumerate(test.on_axis("pose")):
@@ -136,7 +136,7 @@ def test_a_test_scene_is_found_on_every_task_that_begins_in_it(test: TestSet) ->
         find_task("libero_90", "KITCHEN_SCENE1_put_the_black_bowl_on_the_plate"),
     )
     assert planted[0].nearest(test, same).distance == 0
-    held_clear = PlannedDraws([row(same, planted, "planned")])
+    held_clear = PlannedPerturbations([row(same, planted, "planned")])
     assert held_clear.nearest(planted[0], find_task(tested.suite, tested.base)) == (0, "planned")
     assert held_clear.nearest(planted[0], another) == (math.inf, "")
     both = [row(same, planted, "planted"), row(another, planted, "elsewhere")]
@@ -164,12 +164,12 @@ def test_coverage_counts_the_episodes_that_were_kept(test: TestSet) -> None:
 
 
 @pytest.mark.slow
-def test_scenes_are_drawn_clear_of_every_test_scene_and_cover_them_all(test: TestSet) -> None:
+def test_scenes_keep_their_clearance_from_every_test_scene_and_cover_them_all(test: TestSet) -> None:
     axis, rows = PoseAxis(components=("scene",)), []
     for suite in SUITES[:4]:
         for task in tasks(suite):
-            draws = islice(Sampler("pose", (axis,), 5, test).sample(task.name, task), 20)
-            rows += [row(task, drawn, f"{task.name}{number}") for number, drawn in enumerate(draws)]
+            samples = islice(Sampler("pose", (axis,), 5, test).sample(task.name, task), 20)
+            rows += [row(task, perturbations, f"{task.name}{number}") for number, perturbations in enumerate(samples)]
     finding = leakage.check(rows, test)["pose"]
     assert (finding.rows, finding.overlaps, finding.verdict) == (800, 0, "disjoint")
     assert finding.smallest is not None
@@ -182,15 +182,15 @@ def test_scenes_are_drawn_clear_of_every_test_scene_and_cover_them_all(test: Tes
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_draws_are_mostly_clear_and_the_rest_is_counted(axis: str, test: TestSet) -> None:
-    drawn = AXES[axis]()
+def test_perturbations_mostly_keep_their_clearance_and_the_rest_is_counted(axis: str, test: TestSet) -> None:
+    sampled_axis = AXES[axis]()
     rows, overlaps = [], 0
-    changed = [task for suite in SUITES[:4] if drawn.applies(task := tasks(suite)[3])]
+    changed = [task for suite in SUITES[:4] if sampled_axis.applies(task := tasks(suite)[3])]
     assert len(changed) > 1
     for task in changed:
         suite = task.suite
         for variant in range(40):
-            perturbation = drawn.sample(seeding.rng(5, axis, suite, variant), task, variant)
+            perturbation = sampled_axis.sample(seeding.rng(5, axis, suite, variant), task, variant)
             assert 1 <= perturbation.level <= 5
             overlaps += perturbation.nearest(test, task).distance < perturbation.clearance
             rows.append(row(task, [perturbation], f"{suite}{variant}"))
@@ -243,8 +243,8 @@ def test_coverage_is_by_task_where_a_task_has_test_tasks_of_its_own(test: TestSe
 @pytest.mark.parametrize("axis", ["light", "background", "layout"])
 def test_where_near_cannot_be_told_from_far_there_is_no_coverage(axis: str, test: TestSet) -> None:
     task = tasks(SUITES[2])[3]
-    drawn = AXES[axis]().sample(seeding.rng(5, axis), task, 0)
-    coverage = leakage.check([row(task, [drawn], "one")], test)[axis].coverage
+    perturbation = AXES[axis]().sample(seeding.rng(5, axis), task, 0)
+    coverage = leakage.check([row(task, [perturbation], "one")], test)[axis].coverage
     assert {(found.compared, found.median) for found in coverage.values()} == {(0, None)}
 
 

@@ -1,4 +1,4 @@
-"""A row of noise that is as strong as a severity of the benchmark would never be drawn: it is refused."""
+"""A row of noise that is as strong as a severity of the benchmark would never be sampled: it is rejected."""
 
 import pytest
 

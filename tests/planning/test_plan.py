@@ -1,4 +1,4 @@
-"""The plan: keyed draws, quotas with replacements in plan order, and every row accounted for."""
+"""The plan: keyed samples, quotas with replacements in plan order, and every row accounted for."""
 
 import re
 from collections import Counter
@@ -52,18 +52,18 @@ def config(**changes: object) -> PlanConfig:
 
 
 def test_a_row_depends_on_its_key_alone() -> None:
-    """Order of the demonstrations, other axes and other demonstrations leave a draw as it is."""
+    """Order of the demonstrations, other axes and other demonstrations leave a perturbation as it is."""
     whole = {row.episode_id: row for row in plan.make(entries(), config(), REPLAY, NO_TESTS)}
     backwards = plan.make(entries()[::-1], config(), REPLAY, NO_TESTS)
-    drawn = {(r.demo_id, r.axis, r.variant): r.perturbations for r in whole.values()}
+    perturbations = {(r.demo_id, r.axis, r.variant): r.perturbations for r in whole.values()}
     again = {(r.demo_id, r.axis, r.variant): r.perturbations for r in backwards}
-    common = drawn.keys() & again.keys()
+    common = perturbations.keys() & again.keys()
     assert len(common) > 20
-    assert all(drawn[key] == again[key] for key in common)
+    assert all(perturbations[key] == again[key] for key in common)
     camera_only = plan.make(entries(), config(axes=Axes(camera=CameraAxis()), episodes={"camera": 9}), REPLAY, NO_TESTS)
     assert {row.episode_id for row in camera_only} <= whole.keys()
     other_seed = plan.make(entries(), config(seed=4), REPLAY, NO_TESTS)
-    assert not {r.perturbations for r in other_seed if r.axis == "camera"} & set(drawn.values())
+    assert not {r.perturbations for r in other_seed if r.axis == "camera"} & set(perturbations.values())
 
 
 def test_quotas_are_spread_evenly_and_twins_complete() -> None:
@@ -105,7 +105,7 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 def test_no_flipped_bit_is_read(tmp_path: Path) -> None:
-    """Either the plan is refused, or it is the one that was written."""
+    """Either the plan is rejected, or it is the one that was written."""
     rows, file = plan.make(entries(), config(), REPLAY, NO_TESTS), tmp_path / "plan.parquet"
     plan.write(rows, file)
     content = file.read_bytes()
@@ -189,37 +189,39 @@ def test_an_exhausted_axis_is_said_and_planned_as_far_as_it_goes() -> None:
     wanted = config(axes=Axes(language=LanguageAxis()), episodes={"language": 300})
     rows = plan.make(entries(1), wanted, REPLAY, NO_TESTS)
     texts = {(row.task, row.instruction) for row in rows if row.axis == "language"}
-    bank = {(task.name, drawn.text) for task in TASKS for drawn in list_rewrites(task, LanguageAxis().components)}
+    bank = {(task.name, rewrite.text) for task in TASKS for rewrite in list_rewrites(task, LanguageAxis().components)}
     assert texts == bank, "every rewrite once"
     assert plan.shortage(rows, wanted) == {"language": 300 - len(bank)}
     assert plan.shortage(plan.make(entries(), config(), REPLAY, NO_TESTS), config()) == {}
 
 
-def test_a_demonstration_that_has_no_more_draws_leaves_the_places_to_the_others() -> None:
-    """The last different draws are found by chance: of 60, one demonstration finds more of them than another."""
+def test_a_demonstration_without_further_perturbations_leaves_the_places_to_the_others() -> None:
+    """The last perturbations are found by chance: of 60, one demonstration finds more of them than another."""
     few = BackgroundAxis(components=("surface",), sources=("libero",))
     wanted = config(axes=Axes(background=few), episodes={"background": 2000}, reserve=0.0)
     demos = entries()
-    drawn = {
+    sampled = {
         demo.demo_id: {
-            to_json(draw)
-            for draw in plan.Sampler("background", (few,), wanted.seed, NO_TESTS).sample(demo.demo_id, demo.task)
+            to_json(perturbations)
+            for perturbations in plan.Sampler("background", (few,), wanted.seed, NO_TESTS).sample(
+                demo.demo_id, demo.task
+            )
         }
         for demo in demos
     }
-    of_task = {task.name: {len(drawn[demo.demo_id]) for demo in demos if demo.task == task} for task in TASKS}
+    of_task = {task.name: {len(sampled[demo.demo_id]) for demo in demos if demo.task == task} for task in TASKS}
     assert any(len(numbers) > 1 for numbers in of_task.values()), "some end before others of their task"
     rows = [row for row in plan.make(demos, wanted, REPLAY, NO_TESTS) if row.role == "perturbed"]
-    assert {name: {row.perturbations for row in rows if row.demo_id == name} for name in drawn} == drawn
+    assert {name: {row.perturbations for row in rows if row.demo_id == name} for name in sampled} == sampled
     for task in TASKS:
         assert [row.rank for row in rows if row.task == task.name] == list(
             range(sum(r.task == task.name for r in rows))
         )
-    assert plan.shortage(rows, wanted) == {"background": 2000 - sum(map(len, drawn.values()))}
+    assert plan.shortage(rows, wanted) == {"background": 2000 - sum(map(len, sampled.values()))}
 
 
-def test_draws_that_overlap_with_a_test_task_are_drawn_anew() -> None:
-    """Plant what was drawn first into the test set: the plan moves away from it, and nothing else changes."""
+def test_perturbations_that_overlap_with_a_test_task_are_sampled_again() -> None:
+    """Plant what was sampled first into the test set: the plan moves away from it, and nothing else changes."""
     camera = config(axes=Axes(camera=CameraAxis()), episodes={"camera": 9})
     first = [row for row in plan.make(entries(), camera, REPLAY, NO_TESTS) if row.axis == "camera"]
     (planted,) = from_json(first[0].perturbations)
@@ -229,21 +231,21 @@ def test_draws_that_overlap_with_a_test_task_are_drawn_anew() -> None:
     again = [row for row in plan.make(entries(), camera, REPLAY, test) if row.axis == "camera"]
     assert again[0].perturbations != first[0].perturbations
     for row in again:
-        (drawn,) = from_json(row.perturbations)
-        assert drawn.nearest(test, TASKS[0]).distance >= drawn.clearance
+        (perturbation,) = from_json(row.perturbations)
+        assert perturbation.nearest(test, TASKS[0]).distance >= perturbation.clearance
     assert sum(one.perturbations == other.perturbations for one, other in zip(first, again, strict=True)) >= 5
 
 
-def test_levels_near_the_test_set_are_drawn_as_often_as_others() -> None:
+def test_levels_near_the_test_set_are_sampled_as_often_as_others() -> None:
     """Of level 1 here one scene in seven keeps clear of the benchmark's, of level 5 nearly each."""
     study = next(task for task in tasks("libero_10") if task.name.startswith("STUDY_SCENE1"))
-    draws = plan.Sampler("pose", (PoseAxis(),), 3, benchmark.load()).sample("demo_0", study)
-    levels = Counter(scene.level for (scene,) in islice(draws, 200))
+    samples = plan.Sampler("pose", (PoseAxis(),), 3, benchmark.load()).sample("demo_0", study)
+    levels = Counter(scene.level for (scene,) in islice(samples, 200))
     assert chisquare([levels[level] for level in LEVELS]).pvalue > 0.01
 
 
-def test_a_rewrite_stays_where_what_is_beside_it_is_drawn_anew() -> None:
-    """So that all of a task's are drawn once before one comes again."""
+def test_a_rewrite_stays_where_its_camera_is_sampled_again() -> None:
+    """So that all of a task's are sampled once before one comes again."""
     axes = (CameraAxis(), LanguageAxis())
     of = ("camera+language", axes, 3)
     number = len(list_rewrites(TASKS[0]))
@@ -329,11 +331,11 @@ def test_a_combination_is_the_same_in_whatever_order_it_was_written() -> None:
     assert len(rows) == 9, "six wanted and half as many in reserve"
     assert sorted(sum(row.wanted and row.task == task.name for row in rows) for task in TASKS) == [2, 2, 2]
     for row in rows:
-        drawn = from_json(row.perturbations)
-        assert row.axis == "camera+noise+language" == "+".join(p.axis for p in drawn)
-        assert row.component == "+".join(p.component for p in drawn)
-        assert row.level == "+".join(str(p.level) for p in drawn)
-        assert row.instruction in {p.text for p in drawn if isinstance(p, LanguagePerturbation)}
+        perturbations = from_json(row.perturbations)
+        assert row.axis == "camera+noise+language" == "+".join(p.axis for p in perturbations)
+        assert row.component == "+".join(p.component for p in perturbations)
+        assert row.level == "+".join(str(p.level) for p in perturbations)
+        assert row.instruction in {p.text for p in perturbations if isinstance(p, LanguagePerturbation)}
     levels = {tuple(p.level for p in from_json(row.perturbations)) for row in rows}
     assert any(len(set(of_parts)) > 1 for of_parts in levels), "each part has a level of its own"
 
@@ -350,11 +352,11 @@ def test_a_combination_fills_a_quota_of_its_own() -> None:
         entries(), config(axes=Axes(camera=CameraAxis()), episodes={"camera": 3}, reserve=0), REPLAY, NO_TESTS
     )
     assert {row.episode_id for row in alone} <= {row.episode_id for row in rows}
-    drawn = [
+    sampled = [
         next(plan.Sampler(name, (CameraAxis(),), 3, NO_TESTS).sample("demo_0", TASKS[0]))
         for name in ("camera", "camera+noise")
     ]
-    assert drawn[0] != drawn[1], "it has draws of its own"
+    assert sampled[0] != sampled[1], "it has samples of its own"
 
 
 def test_every_part_of_a_combination_keeps_clear_of_the_test_set() -> None:

@@ -69,11 +69,11 @@ def test_no_sample_of_a_plan_is_within_a_centimetre_of_the_other_tasks_tests(tas
     with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as archive:
         scenes = scenes_of_tests(archive)
     assert len(scenes) > 30
-    draws = Sampler("pose", (PoseAxis(levels=(1,)),), 1, benchmark.load(FOLDER))
+    sampler = Sampler("pose", (PoseAxis(levels=(1,)),), 1, benchmark.load(FOLDER))
     within = 0
-    for (drawn,) in islice(draws.sample(task.name, task), 200):
-        assert isinstance(drawn, ScenePerturbation)
-        places = moved_places(task, drawn.shifts)
+    for (perturbation,) in islice(sampler.sample(task.name, task), 200):
+        assert isinstance(perturbation, ScenePerturbation)
+        places = moved_places(task, perturbation.shifts)
         assert all(places.keys() == scene.keys() for scene in scenes)
         within += min(largest_difference_m(places, scene) for scene in scenes) < ScenePerturbation.clearance
     assert within == 0

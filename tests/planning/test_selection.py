@@ -12,7 +12,7 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
 
 
-def test_a_reserve_is_replayed_once_frames_before_it_are_refused() -> None:
+def test_a_reserve_is_replayed_once_frames_before_it_are_rejected() -> None:
     demo = DemoEntry(BOWL, "demo_0", "test", "human", "id", steps=100)
     (row,) = plan.make(
         [demo], PlanConfig(seed=7, axes=Axes(light=LightAxis()), episodes={"light": 1}), ReplayConfig(), TestSet(())

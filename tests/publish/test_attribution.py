@@ -38,8 +38,8 @@ def test_everything_that_is_shown_is_attributed_and_nothing_else() -> None:
 
 
 def test_a_texture_on_two_parts_of_a_scene_is_one_episode() -> None:
-    drawn = BackgroundAxis(components=("theme",)).sample(rng("inventory"), MILK, 0)
-    same = drawn.model_copy(update={"coverings": (drawn.coverings[0],) * 2})
+    perturbation = BackgroundAxis(components=("theme",)).sample(rng("inventory"), MILK, 0)
+    same = perturbation.model_copy(update={"coverings": (perturbation.coverings[0],) * 2})
     assert list(attributions([row(same)]).values()) == [1]
 
 

@@ -1,4 +1,4 @@
-"""The card says what the run's files say, its pictures are beside it, and the hub can read its metadata."""
+"""The card says what the run's files say, its pictures are next to it, and the hub can read its metadata."""
 
 import json
 import re
@@ -125,7 +125,7 @@ def test_a_download_can_be_checked(data: Path, tmp_path: Path, kind: str, path: 
     assert subprocess.run(check, cwd=download, check=False, capture_output=True).returncode == 1
 
 
-def test_pictures_are_beside_the_card_and_only_those_that_exist(data: Path) -> None:
+def test_pictures_are_next_to_the_card_and_only_those_that_exist(data: Path) -> None:
     text = written(data, "lerobot")
     shown = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert shown == ["pictures/camera.png", "pictures/camera+background.png"]
@@ -175,7 +175,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("kind", NAMES)
-def test_what_is_beside_the_frames_is_described_where_it_is_there(data: Path, kind: str) -> None:
+def test_columns_in_addition_to_the_frames_are_described_where_they_are_there(data: Path, kind: str) -> None:
     plain = written(data, kind)
     for matrix in ("intrinsics", "extrinsics"):
         views = ("image", "wrist_image") if kind == "rlds" else ("camera.agent", "camera.wrist")
@@ -206,7 +206,7 @@ def test_depth_as_video_and_its_readers_are_named(data: Path) -> None:
 
 
 def test_a_language_column_and_who_can_open_it_are_named(data: Path) -> None:
-    # As it is written by lerobot 0.6, where the field is not refused.
+    # As it is written by lerobot 0.6, where the field is not rejected.
     lerobot = LeRobotConfig(name=NAME).model_copy(update={"language": True})
     text = written(data, "lerobot", ExportConfig.model_validate({"rlds": None}).model_copy(update={"lerobot": lerobot}))
     assert "`language_persistent`" in text

@@ -57,7 +57,7 @@ def test_demonstrations_of_own_tasks_are_not_attributed_to_libero(data: Path) ->
         assert claim not in text
     assert "The dataset derives from 1 recorded demonstrations of 1 tasks." in text
     assert "**Demonstrations and tasks of my_suite**: by the publisher of this dataset" in text
-    # Beside LIBERO's, both are named.
+    # In addition to LIBERO's, both are named.
     write_rows(data, [*own, row("clean", task=STOVE)], "hdf5")
     text = written(data, "lerobot")
     metadata = metadata_of(text)

@@ -71,7 +71,7 @@ def large(upload: Upload) -> set[str]:
 
 
 def with_images(data: Path) -> Upload:
-    """The same episodes exported anew, with images in place of videos."""
+    """The same episodes exported again, with images in place of videos."""
     write_lerobot(data, name=NAME, frames="images")
     (data / "validation.json").write_bytes((data / "validation.json").read_bytes())
     write_card(data)
@@ -371,9 +371,9 @@ def test_the_command_says_all_of_it_and_sends_it_when_asked(hub: Hub, data: Path
     assert done.returncode == 0, done.stderr
     assert (hub.private, json.loads(hub.files[UPLOAD])["format"]) == (True, "lerobot")
     hub.files["README.md"] += b"mine"
-    refused = push()
-    assert refused.returncode == 1
-    assert "README.md" in refused.stderr
+    rejected = push()
+    assert rejected.returncode == 1
+    assert "README.md" in rejected.stderr
 
 
 def test_without_a_network_the_files_are_still_named(hub: Hub, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:

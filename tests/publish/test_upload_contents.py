@@ -171,7 +171,7 @@ def rotten(data: Path) -> None:
         (incomplete, r"1 files are missing, such as tiny/videos/.*\.mp4"),
     ],
 )
-def test_refuses(data: Path, spoil: Callable[[Path], None], complaint: str) -> None:
+def test_an_incomplete_or_foreign_upload_is_rejected(data: Path, spoil: Callable[[Path], None], complaint: str) -> None:
     assert prepare(data, "lerobot").files
     spoil(data)
     with pytest.raises(PipelineError, match=complaint):
@@ -185,7 +185,7 @@ def test_a_run_that_repeats_its_checks_with_the_same_result_may_be_uploaded(data
     assert prepare(data, "lerobot").files == files
 
 
-def test_refuses_the_card_of_an_earlier_dataset(data: Path) -> None:
+def test_the_card_of_an_earlier_dataset_is_rejected(data: Path) -> None:
     """As after a change of the format's options, where the stage ``card`` stopped because of another card's edits."""
     write_card(data, checksums=True)
     assert "SHA256SUMS" in prepare(data, "lerobot").others
@@ -201,7 +201,7 @@ def test_refuses_the_card_of_an_earlier_dataset(data: Path) -> None:
     assert prepare(data, "lerobot").files
 
 
-def test_files_beside_the_card_of_another_format_stop_nothing(data: Path) -> None:
+def test_files_next_to_the_card_of_another_format_stop_nothing(data: Path) -> None:
     (data / "card" / "rlds" / "notes.txt").write_text("mine")
     assert "notes.txt" not in prepare(data, "lerobot").files
 
@@ -215,7 +215,7 @@ def test_passes_by_the_statistics_that_openvla_oft_leaves_in_rlds(data: Path) ->
     assert dvc(REPOSITORY, "check-ignore", f"data/starter/rlds/{statistics}").returncode == 0
 
 
-def test_refuses_what_else_training_left_in_rlds(data: Path) -> None:
+def test_files_that_training_left_in_rlds_are_rejected(data: Path) -> None:
     (data / "rlds" / SET / "1.0.0" / "loss.csv").write_text("1,2")
     with pytest.raises(PipelineError, match=r"1 foreign files.*loss\.csv") as caught:
         prepare(data, "rlds")

@@ -1,4 +1,4 @@
-"""In each of LIBERO's arenas, pictures with savings and plain ones are those that MuJoCo's own renderer draws."""
+"""In each of LIBERO's arenas, pictures with savings and plain ones are those that MuJoCo's own renderer gives."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -10,15 +10,15 @@ import pytest
 from arenas import TASKS, VIEWS, both_ways
 
 from pipeline import seeding
-from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import say_once
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.software_renderer import SoftwareRenderer
 
 pytestmark = pytest.mark.slow
 
-Arena = tuple[str, Renderer, SoftwareDrawing, PlainDrawing]
-"""Its name, and its scene drawn with savings and plainly."""
+Arena = tuple[str, Renderer, SoftwareRenderer, PlainRenderer]
+"""Its name, and its scene rendered with savings and plainly."""
 
 
 @pytest.fixture(scope="module", params=TASKS)

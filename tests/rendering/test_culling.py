@@ -35,7 +35,7 @@ def scene(shadows: bool) -> str:
 
 
 @pytest.mark.parametrize("shadows", [False, True], ids=["lights", "shadows"])
-def test_the_same_pixels_with_less_drawn(shadows: bool) -> None:
+def test_the_same_pixels_with_fewer_geoms(shadows: bool) -> None:
     rng = seeding.rng("test_culling", "eyes")
     left_out, reflecting = 0, []
     opened = Renderer(scene(shadows))

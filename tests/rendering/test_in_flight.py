@@ -1,4 +1,4 @@
-"""Drawings for GPUs give the frames of plain rendering in their order, also while several frames are in flight."""
+"""Renderers for GPUs give the frames of plain rendering in their order, also while several frames are in flight."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -14,16 +14,16 @@ from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.planning.streams import Stream
 from pipeline.rendering import savings
-from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.render import frames_of_steps
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.software.in_flight import BUFFERS, InFlightDrawing
-from pipeline.rendering.software.layers import LayersDrawing
+from pipeline.rendering.software.in_flight import BUFFERS, InFlightRenderer
+from pipeline.rendering.software.layers import LayeredRenderer
 from pipeline.scenes.compiled import compile_model
 from pipeline.seeding import rng
 from pipeline.types import Frame, Task, Trajectory
 
-KINDS = pytest.mark.parametrize("kind", [InFlightDrawing, LayersDrawing])
+KINDS = pytest.mark.parametrize("kind", [InFlightRenderer, LayeredRenderer])
 
 
 def states(model: mujoco.MjModel, count: int) -> Iterator[mujoco.MjData]:
@@ -37,20 +37,20 @@ def states(model: mujoco.MjModel, count: int) -> Iterator[mujoco.MjData]:
 
 
 @KINDS
-def test_frames_are_plain_frames_with_and_without_shadows(kind: type[PlainDrawing]) -> None:
+def test_frames_are_plain_frames_with_and_without_shadows(kind: type[PlainRenderer]) -> None:
     """The mirror, the sky behind and the textures of the small scene show in its frames."""
-    plain, in_flight = savings.frames(PlainDrawing), savings.frames(kind)
+    plain, in_flight = savings.frames(PlainRenderer), savings.frames(kind)
     assert len(plain) == 8, "four states, without and with shadows"
     np.testing.assert_array_equal(np.stack(in_flight), np.stack(plain))
 
 
 @KINDS
-def test_more_frames_in_flight_than_buffers_keep_their_order(kind: type[PlainDrawing]) -> None:
+def test_more_frames_in_flight_than_buffers_keep_their_order(kind: type[PlainRenderer]) -> None:
     model, count = mujoco.MjModel.from_xml_string(savings.SCENE), BUFFERS + 3
-    with closing(PlainDrawing(model)) as plain:
+    with closing(PlainRenderer(model)) as plain:
         expected = [plain.frame(data, "eye") for data in states(model, count)]
-    with closing(kind(model)) as drawing:
-        started = [drawing.start_frame(data, "eye") for data in states(model, count)]
+    with closing(kind(model)) as renderer:
+        started = [renderer.start_frame(data, "eye") for data in states(model, count)]
         last_first = [wait() for wait in reversed(started)]
     np.testing.assert_array_equal(np.stack(last_first[::-1]), np.stack(expected))
     assert not any(np.array_equal(frame, following) for frame, following in pairwise(expected))
@@ -58,18 +58,18 @@ def test_more_frames_in_flight_than_buffers_keep_their_order(kind: type[PlainDra
 
 @KINDS
 def test_steps_in_flight_are_yielded_in_order_with_the_noise_of_their_step(
-    kind: type[PlainDrawing], whole: dict[Task, Trajectory]
+    kind: type[PlainRenderer], whole: dict[Task, Trajectory]
 ) -> None:
     trajectory = replace(whole[MILK], actions=whole[MILK].actions[:6])
     moved = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
     noise = NoiseAxis().sample(rng("in flight"), MILK, 0)
     streams = [Stream("image", (moved, noise)), Stream("wrist_image", (moved,))]
 
-    def steps_by(drawing_kind: type[PlainDrawing]) -> list[list[Frame]]:
+    def steps_by(renderer_kind: type[PlainRenderer]) -> list[list[Frame]]:
         model = compile_model(trajectory.model_xml)
-        with closing(Renderer(model, drawing_kind(model))) as renderer:
+        with closing(Renderer(model, renderer_kind(model))) as renderer:
             return list(frames_of_steps(renderer, trajectory, streams))
 
-    expected, in_flight = steps_by(PlainDrawing), steps_by(kind)
+    expected, in_flight = steps_by(PlainRenderer), steps_by(kind)
     assert len(in_flight) == len(expected) == 6
     assert all(np.array_equal(*pair) for pair in zip(in_flight, expected, strict=True))

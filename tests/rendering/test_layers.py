@@ -1,4 +1,4 @@
-"""What stands still is drawn once, and every picture is the one that MuJoCo draws at once."""
+"""What stands still is rendered once, and every picture is the one that MuJoCo renders at once."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from arenas import both_ways
 from numpy.typing import NDArray
 
 from pipeline import seeding
-from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.software.drawing import Shot, SoftwareDrawing
+from pipeline.rendering.software.software_renderer import Shot, SoftwareRenderer
 
 BODIES = 12
 CAMERAS = ("fixed", "moving")
@@ -56,16 +56,16 @@ def scene(shadows: bool) -> str:
 
 @dataclass
 class Pair:
-    """A scene drawn with savings and plainly.
+    """A scene rendered with savings and plainly.
 
     Attributes:
-        drawn: how many bodies' geoms each call to OpenGL had to draw.
+        rendered: how many bodies' geoms each call to OpenGL had to render.
     """
 
     opened: Renderer
-    ours: SoftwareDrawing
-    plain: PlainDrawing
-    drawn: list[int]
+    ours: SoftwareRenderer
+    plain: PlainRenderer
+    rendered: list[int]
 
     def same(self, *cameras: str) -> bool:
         mujoco.mj_forward(self.opened.model, self.opened.data)
@@ -78,13 +78,13 @@ class Pair:
 def pair(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]:
     opened = Renderer(scene(shadows=getattr(request, "param", False)))
     with both_ways(opened) as (ours, plain):
-        draw, made = ours._draw_geoms, Pair(opened, ours, plain, [])
+        render_geoms, made = ours._render_geoms, Pair(opened, ours, plain, [])
 
         def counted(shot: Shot, opaque: NDArray[np.bool_], *how: Any, **more: Any) -> None:
-            made.drawn.append(int(opaque[-BODIES:].sum()))
-            draw(shot, opaque, *how, **more)
+            made.rendered.append(int(opaque[-BODIES:].sum()))
+            render_geoms(shot, opaque, *how, **more)
 
-        monkeypatch.setattr(ours, "_draw_geoms", counted)
+        monkeypatch.setattr(ours, "_render_geoms", counted)
         yield made
 
 
@@ -105,7 +105,7 @@ def test_the_same_pixels_whatever_moves(pair: Pair) -> None:
 def test_at_equal_depth_the_same_geom_shows() -> None:
     """The tops of all boxes, and of the site, lie in one plane. The green box moves over the others.
 
-    MuJoCo shows the geom that it draws last: the green one over the red one, the blue one over the green one, and the
+    MuJoCo shows the geom that it renders last: the green one over the red one, the blue one over the green one, and the
     site over the red one.
     """
     box = 'type="box" size="0.3 0.2 0.1"'
@@ -131,15 +131,15 @@ def test_at_equal_depth_the_same_geom_shows() -> None:
         assert len(colours) >= 4, "all four show"
 
 
-def test_what_stands_still_is_drawn_once(pair: Pair) -> None:
+def test_geoms_that_stand_still_are_rendered_once(pair: Pair) -> None:
     for step in range(30):
         pair.opened.data.mocap_pos[0, 2] = 0.01 * step
         mujoco.mj_forward(pair.opened.model, pair.opened.data)
         if step == 10:
-            pair.drawn.clear()
+            pair.rendered.clear()
         pair.opened.frame("fixed")
     assert len(pair.ours._underlays) == 1
-    assert sum(pair.drawn) < 20 * BODIES
+    assert sum(pair.rendered) < 20 * BODIES
 
 
 def test_what_trembles_is_left_out_of_the_layer(pair: Pair) -> None:
@@ -147,9 +147,9 @@ def test_what_trembles_is_left_out_of_the_layer(pair: Pair) -> None:
         pair.opened.data.mocap_pos[:3, 2] += 1e-5 * (step % 5 == 0)
         mujoco.mj_forward(pair.opened.model, pair.opened.data)
         if step == 40:
-            pair.drawn.clear()
+            pair.rendered.clear()
         pair.opened.frame("fixed")
-    assert max(pair.drawn) < BODIES, "the underlay of those that stand still is as it was"
+    assert max(pair.rendered) < BODIES, "the underlay of those that stand still is as it was"
 
 
 @pytest.mark.parametrize(

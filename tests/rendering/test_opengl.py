@@ -147,7 +147,7 @@ for name, case in cases.items():
     except PipelineError as error:
         print(name, "|", *str(error).splitlines())
         if case is not underlay:
-            # The exception still refers to the drawing that was not made.
+            # The exception still refers to the renderer that was not created.
             print("left open:", sum(isinstance(each, GLContext) and bool(each._context) for each in gc.get_objects()))
     gc.collect()
 """

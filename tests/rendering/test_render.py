@@ -174,7 +174,7 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     trajectory = replace(source, states=source.states[:9], actions=source.actions[:8])
     night = LightPerturbation(component="diffuse", level=5, diffuse_scale_rgb=(0.0, 0.0, 0.0))
     streams = [Stream("image", ()), Stream("image", (night,)), Stream("image", (MOVED,))]
-    # LIBERO's head light keeps frames from being black, so put it out as no draw can.
+    # LIBERO's head light keeps frames from being black, so put it out as no perturbation can.
     dark = '<visual><headlight diffuse="0 0 0" ambient="0 0 0" specular="0 0 0"/></visual>'
     unlit = trajectory.model_xml.replace("<worldbody>", f"{dark}<worldbody>", 1)
     rendered = render(
@@ -259,7 +259,7 @@ def test_the_hand_is_outside_where_its_place_is_not_in_the_frame(
     assert {renderer.model.body(name).id for name in ("milk_1_main", "basket_1_main")} <= bodies, "these are seen"
     camera = renderer.data.camera("agentview")
     ahead_m = -camera.xmat.reshape(3, 3)[:, 2]
-    beside_m = [within_m[0] + [0.0, 2.0, 0.0], within_m[0] - [0.0, 2.0, 0.0], camera.xpos - ahead_m]
+    outside_m = [within_m[0] + [0.0, 2.0, 0.0], within_m[0] - [0.0, 2.0, 0.0], camera.xpos - ahead_m]
     assert Sight.of(renderer, MILK, np.array([*within_m, camera.xpos + ahead_m])).hand_outside == 0.0
-    assert Sight.of(renderer, MILK, np.array(beside_m)).hand_outside == 1.0
-    assert Sight.of(renderer, MILK, np.array([*within_m, *beside_m])).hand_outside == 3 / 5
+    assert Sight.of(renderer, MILK, np.array(outside_m)).hand_outside == 1.0
+    assert Sight.of(renderer, MILK, np.array([*within_m, *outside_m])).hand_outside == 3 / 5

@@ -14,10 +14,10 @@ from arenas import TASKS, frames
 
 from pipeline.axes.light import LightPerturbation
 from pipeline.physics.environment import Environment
-from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import calls
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.renderer import LastScene, Renderer
-from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.software_renderer import SoftwareRenderer
 from pipeline.types import Floats, Frame
 
 SHADOWS = LightPerturbation(component="shadows", level=5, shadows=True)
@@ -51,34 +51,34 @@ def test_one_context_shows_one_scene_after_the_other_as_contexts_of_their_own() 
     expected = {}
     for name, (model_xml, state) in scenes.items():
         model = mujoco.MjModel.from_xml_string(model_xml)
-        with closing(Renderer(model, PlainDrawing(model))) as alone:
+        with closing(Renderer(model, PlainRenderer(model))) as alone:
             expected[name] = shown(alone, state)
     assert any((expected["elsewhere"][view] != frame).any() for view, frame in expected["tabletop"].items())
 
     with closing(LastScene()) as opened:
-        first = opened.renderer(scenes["tabletop"][0]).drawing
+        first = opened.renderer(scenes["tabletop"][0]).model_renderer
         for turn, name in enumerate(("tabletop", "elsewhere", "kitchen", "living_room", "floor", "study", "tabletop")):
             model_xml, state = scenes[name]
             # A model has its images; of MJCF, those are read that the scene before does not have.
             renderer = opened.renderer(model_xml if turn % 4 else mujoco.MjModel.from_xml_string(model_xml))
-            assert renderer.drawing is first
+            assert renderer.model_renderer is first
             for view, frame in shown(renderer, state).items():
                 assert np.array_equal(frame, expected[name][view]), (name, view)
 
 
 @pytest.mark.slow
-def test_a_scene_drawn_with_other_buffers_gets_a_context_of_its_own() -> None:
+def test_a_scene_rendered_with_other_buffers_gets_a_context_of_its_own() -> None:
     model_xml, state = arenas.scene("floor")
     with closing(LastScene()) as opened:
         first = opened.renderer(model_xml)
         before = shown(first, state)
         coarse = mujoco.MjModel.from_xml_string(model_xml)
         coarse.vis.quality.offsamples = 0
-        assert not first.drawing.adopt(coarse)
+        assert not first.model_renderer.adopt(coarse)
         assert all(np.array_equal(frame, before[view]) for view, frame in shown(first, state).items())
         second = opened.renderer(coarse)
-        assert isinstance(second.drawing, PlainDrawing)
-        assert not isinstance(second.drawing, SoftwareDrawing)
+        assert isinstance(second.model_renderer, PlainRenderer)
+        assert not isinstance(second.model_renderer, SoftwareRenderer)
         assert any((frame != before[view]).any() for view, frame in shown(second, state).items())
 
 
@@ -139,9 +139,9 @@ def test_frames_of_every_size_share_a_context(size_px: int, tmp_path: Path) -> N
     image = tmp_path / "image.png"
     cv2.imwrite(str(image), np.arange(192, dtype=np.uint8).reshape(8, 8, 3))
     with closing(LastScene()) as opened:
-        first = opened.renderer(painted("box", image), size_px).drawing
+        first = opened.renderer(painted("box", image), size_px).model_renderer
         renderer = opened.renderer(painted("sphere", image), size_px)
-        assert renderer.drawing is first
+        assert renderer.model_renderer is first
         mujoco.mj_forward(renderer.model, renderer.data)
         frame = renderer.frame("agentview")
     with closing(Renderer(painted("sphere", image), size_px=size_px)) as alone:

@@ -1,4 +1,4 @@
-"""No camera of a test task is refused for the hand; one that shows less of it than all of them is."""
+"""No camera of a test task is rejected for the hand; one that shows less of it than all of them is."""
 
 import numpy as np
 import pytest

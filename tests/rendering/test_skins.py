@@ -1,4 +1,4 @@
-"""Of a mesh only the faces are drawn that a picture can show, and every picture is the one that MuJoCo draws of all."""
+"""Of a mesh only faces that can show are rendered, and every picture is the one that MuJoCo renders of all faces."""
 
 import ctypes
 from contextlib import closing
@@ -122,8 +122,8 @@ def twice_area(corners_px: Floats) -> Floats:
     return areas
 
 
-class Drawing:
-    """Faces drawn by OpenGL alone into MuJoCo's buffer, from a display list or by the order of a buffer."""
+class FaceRenderer:
+    """Faces rendered by OpenGL alone into MuJoCo's buffer, from a display list or by the order of a buffer."""
 
     def __init__(self) -> None:
         gl.prepare()
@@ -139,7 +139,7 @@ class Drawing:
         Args:
             places: (V, 4) in OpenGL's clip coordinates.
             listed: numbers of the corners.
-            by_list: whether from a display list, as MuJoCo draws meshes, or from buffers, as it draws skins.
+            by_list: whether from a display list, as MuJoCo renders meshes, or from buffers, as it renders skins.
         """
         opengl, context = calls(), self._renderer._mjr_context
         opengl.glViewport(0, 0, *SIZE_PX)
@@ -183,13 +183,13 @@ class Drawing:
         self._renderer.close()
 
 
-def test_faces_that_turn_around_are_drawn_where_opengl_does_so_of_the_whole_mesh() -> None:
+def test_faces_that_turn_around_are_rendered_where_opengl_does_so_of_the_whole_mesh() -> None:
     """In a batch with a corner outside of the view, OpenGL sorts out what faces away before it rounds corners."""
     rng, turning = seeding.rng("test_skins", "batches"), turning_faces()
     assert len(turning) > 50
     projection = Projection(np.eye(3, 4), 0.1, 10.0, SIZE_PX)
     count, shown = 6 * BATCH_FACES - 50, []
-    with closing(Drawing()) as drawing:
+    with closing(FaceRenderer()) as renderer:
         for outside in (0.0, 0.001, 0.002, 0.01):
             # Far from those that may turn, some face away, some are seen.
             corners_px = rng.uniform((30, 2), (60, 46), (count, 1, 2)) + rng.normal(0, 0.4, (count, 3, 2))
@@ -204,10 +204,10 @@ def test_faces_that_turn_around_are_drawn_where_opengl_does_so_of_the_whole_mesh
             assert written < 0.8 * 3 * count
             clip = np.column_stack([2 * places_m[:, :2] / SIZE_PX - 1, np.full((3 * count, 2), (0.5, 1.0))])
             clip = clip.astype(np.float32)
-            plain = drawing.picture(clip, numbers.ravel(), by_list=True)
-            assert np.array_equal(drawing.picture(clip, found[:written], by_list=False), plain)
+            plain = renderer.picture(clip, numbers.ravel(), by_list=True)
+            assert np.array_equal(renderer.picture(clip, found[:written], by_list=False), plain)
             shown.append(int((plain[:, :30] > 0).sum()))
-    assert shown[0] > shown[-1], "where corners are outside, fewer of those that turn are drawn"
+    assert shown[0] > shown[-1], "where corners are outside, fewer of those that turn are rendered"
 
 
 def stone(name: str, subdivisions: int, texture: bool) -> str:
@@ -250,7 +250,7 @@ def scene(shadows: bool) -> str:
 
 @pytest.mark.parametrize("shadows", [False, True], ids=["lights", "shadows"])
 def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
-    rng, drawn = seeding.rng("test_skins", "moves"), []
+    rng, rendered = seeding.rng("test_skins", "moves"), []
     opened = Renderer(scene(shadows))
     with both_ways(opened) as (ours, plain):
         for _ in range(15):
@@ -262,13 +262,13 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
             for camera in ("fixed", "moving"):
                 ours._skins.rendered[:] = 0
                 frame = opened.frame(camera)
-                drawn.append(ours._skins.rendered.copy())
+                rendered.append(ours._skins.rendered.copy())
                 assert np.array_equal(frame, plain.frame(opened.data, camera)), camera
         whole = opened.model.mesh("painted").facenum[0]
-    faces = np.sum(drawn, axis=0)
+    faces = np.sum(rendered, axis=0)
     assert faces[:SKINS].any(), "with places in a texture"
     assert faces[SKINS:].any(), "without them"
-    assert np.max(drawn) < 0.6 * whole, "half of the faces are on the other side"
+    assert np.max(rendered) < 0.6 * whole, "half of the faces are on the other side"
 
 
 def test_display_lists_may_be_numbered_downwards(monkeypatch: pytest.MonkeyPatch) -> None:

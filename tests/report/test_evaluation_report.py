@@ -1,4 +1,4 @@
-"""The report of evaluations says what the episodes' files say: merged, weighted, compared, beside published rows."""
+"""The report of evaluations says what the episodes' files say: merged, weighted, compared, next to published rows."""
 
 import json
 import re
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from episode_results import analyze, result
-from html_page import Page, needs_nothing_beside_itself, screenshot
+from html_page import Page, needs_no_other_file, screenshot
 from scipy.stats import binomtest
 
 from pipeline import files
@@ -146,7 +146,7 @@ def test_folders_of_several_machines_are_one_result(subset: list[EvaluationTask]
     other = write(tmp_path / "other", [result(task, True, "mine") for task in subset[20:]])
     write(other, [result(subset[0], False, "mine", steps=0, episode="0", reason="refused")])
     (merged,) = read([one, other])
-    assert (merged.name, len(merged.rows), merged.refused) == ("mine", 60, 1)
+    assert (merged.name, len(merged.rows), merged.rejected) == ("mine", 60, 1)
     polluted = write(tmp_path / "polluted", [result(subset[0], False, "mine", "benchmark")])
     names = [policy.name for policy in read([one, polluted], across=["prompt"])]
     assert names == ["mine, prompt clean", "mine, prompt benchmark"]
@@ -209,8 +209,8 @@ def test_policies_are_paired_by_all_of_their_task(subset: list[EvaluationTask]) 
     assert paired([first], [result(task, False, "second")])
     for other in ({"level": task.level + 1}, {"number": 7}, {"component": "another"}, {"base": "another"}):
         assert not paired([first], [result(replace(task, **other), False, "second")]), other
-    for drawn in ({"seed": 1}, {"perturbations": [{"axis": "camera"}]}):
-        assert not paired([first], [result(task, False, "second", **drawn)]), drawn
+    for difference in ({"seed": 1}, {"perturbations": [{"axis": "camera"}]}):
+        assert not paired([first], [result(task, False, "second", **difference)]), difference
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +229,7 @@ def written(subset: list[EvaluationTask], tmp_path_factory: pytest.TempPathFacto
 
 def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) -> None:
     html = written.read_text()
-    needs_nothing_beside_itself(html)
+    needs_no_other_file(html)
     page = Page(html)
     words = " ".join(page.text.split())
     found: dict[str, Any] = json.loads(written.with_suffix(".json").read_text())
@@ -268,7 +268,7 @@ def test_the_overall_rate_of_each_policy_comes_first(written: Path) -> None:
     assert "Bars below numbers: successes failures" in top
 
 
-def test_one_policy_of_few_episodes_is_not_set_beside_published_ones_as_an_equal(
+def test_one_policy_of_few_episodes_is_not_set_next_to_published_ones_as_an_equal(
     subset: list[EvaluationTask], tmp_path: Path
 ) -> None:
     folder = write(tmp_path / "few", [result(subset[0], True, "alone")])

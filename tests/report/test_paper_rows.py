@@ -101,8 +101,8 @@ def of_latex(text: str) -> list[list[str]]:
 
 
 def scored(tests: Iterable[TestTask], solved: float = 0.4) -> list[Outcome]:
-    draws = rng("test_paper_rows")
-    return [Outcome(test.suite, test.name, bool(draws.random() < solved)) for test in tests]
+    generator = rng("test_paper_rows")
+    return [Outcome(test.suite, test.name, bool(generator.random() < solved)) for test in tests]
 
 
 def test_all_tasks_give_plainly_counted_rates_in_all_formats() -> None:

@@ -1,4 +1,4 @@
-"""Contact sheets of real scenes: every layer, both views, refusals, and the sheets of a run."""
+"""Contact sheets of real scenes: every layer, both views, rejections, and the sheets of a run."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Dimming(RenderPerturbation):
 
 
 class Lift(PhysicsPerturbation):
-    """Lifts the arm, in a scene of its own when it is the window's; too much is refused."""
+    """Lifts the arm, in a scene of its own when it is the window's; too much is rejected."""
 
     axis: Literal["lift"] = "lift"
     component: Literal["lamp", "window"] = "lamp"
@@ -89,8 +89,8 @@ class Lift(PhysicsPerturbation):
         return replace(scene, state=state, model_xml=scene.model_xml.replace('model="', f'model="{name}', 1))
 
 
-class Drawn(Axis):
-    """An axis that draws one of the two kinds above."""
+class StubAxis(Axis):
+    """An axis that samples one of the two kinds above."""
 
     kind: type[Dimming] | type[Lift]
 
@@ -121,10 +121,10 @@ def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_
         try:
             after = stage.frames(VIEWS, perturbation)
             break
-        except RejectedError as refused:
-            reason = refused.reason
+        except RejectedError as rejected:
+            reason = rejected.reason
     else:
-        pytest.fail(f"this scene refuses every draw: {reason}")
+        pytest.fail(f"this scene rejects every perturbation: {reason}")
     changed = {view for view, a, b in zip(VIEWS, before, after, strict=True) if not np.array_equal(a, b)}
     # It may change less, as the wrist sees no walls.
     assert changed <= perturbation.views
@@ -135,20 +135,20 @@ def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_
 @pytest.mark.parametrize("name", ["camera", "noise", "language"])
 def test_variants_cover_components_and_levels(stage: preview.Stage, name: str) -> None:
     axis = preview.configured(name, STARTER)
-    drawn = preview.variants(name, axis, stage.demo, 1, NO_TESTS)
-    assert drawn == preview.variants(name, axis, stage.demo, 1, NO_TESTS)
-    assert drawn != preview.variants(name, axis, stage.demo, 2, NO_TESTS) or name == "language"
-    assert len({p.model_dump_json() for p in drawn}) == preview.VARIANTS
-    counts = Counter(p.component for p in drawn)
-    kinds = get_args(type(drawn[0]).model_fields["component"].annotation)
+    sampled = preview.variants(name, axis, stage.demo, 1, NO_TESTS)
+    assert sampled == preview.variants(name, axis, stage.demo, 1, NO_TESTS)
+    assert sampled != preview.variants(name, axis, stage.demo, 2, NO_TESTS) or name == "language"
+    assert len({p.model_dump_json() for p in sampled}) == preview.VARIANTS
+    counts = Counter(p.component for p in sampled)
+    kinds = get_args(type(sampled[0]).model_fields["component"].annotation)
     assert set(counts) == set(kinds)
     assert max(counts.values()) - min(counts.values()) <= 1
-    assert {p.level for p in drawn} == {1, 2, 3, 4, 5}
+    assert {p.level for p in sampled} == {1, 2, 3, 4, 5}
 
 
 @pytest.mark.parametrize("name", ["language", "pose", "camera"])
-def test_what_is_shown_is_what_the_plan_draws(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the benchmark's tasks, which the plan keeps clear of: the last displacement is drawn anew."""
+def test_the_preview_of_an_axis_shows_the_plans_perturbations(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the benchmark's tasks, which the plan keeps clear of: the last displacement is sampled again."""
     monkeypatch.chdir(REPOSITORY)
     for count in ("CANDIDATES", "VARIANTS", "PHYSICS_VARIANTS"):
         monkeypatch.setattr(preview, count, 12)
@@ -160,7 +160,7 @@ def test_what_is_shown_is_what_the_plan_draws(name: str, monkeypatch: pytest.Mon
     assert {to_json([perturbation]) for perturbation in shown} == {row.perturbations for row in rows}
 
 
-def test_a_combination_shows_what_the_plan_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_preview_of_a_combination_shows_the_plans_perturbations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(REPOSITORY)
     name = "camera+noise+language"
     monkeypatch.setattr(preview, "CANDIDATES", 12)
@@ -185,13 +185,13 @@ def test_a_sheet_of_a_combination_covers_its_components_and_changes_pictures_tog
 
     monkeypatch.setattr(preview.Stage, "frames", recorded)
     sheet = preview.axis_sheet(stage, "light+noise", STARTER, NO_TESTS)
-    nothing, *drawn = shown
-    assert (nothing, len(drawn)) == ((), preview.VARIANTS)
-    assert {(light.axis, noise.axis) for light, noise in drawn} == {("light", "noise")}
-    assert {noise.component for _, noise in drawn} == set(components_of("noise"))
-    assert {light.component for light, _ in drawn} == set(components_of("light"))
+    nothing, *sampled = shown
+    assert (nothing, len(sampled)) == ((), preview.VARIANTS)
+    assert {(light.axis, noise.axis) for light, noise in sampled} == {("light", "noise")}
+    assert {noise.component for _, noise in sampled} == set(components_of("noise"))
+    assert {light.component for light, _ in sampled} == set(components_of("light"))
     assert sheet.width == 4 * (2 * preview.SIDE_PX[2] + sheets.GAP_PX) + sheets.GAP_PX
-    light, noise = drawn[0]
+    light, noise = sampled[0]
     both, lit, noisy = (frames(stage, VIEWS, *changes) for changes in ((light, noise), (light,), (noise,)))
     assert not np.array_equal(both[0], lit[0])
     assert not np.array_equal(both[0], noisy[0])
@@ -208,7 +208,7 @@ def test_a_combination_without_anything_left_is_an_error() -> None:
 
 
 def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Dimming))
+    monkeypatch.setattr(preview, "configured", lambda name, config: StubAxis(kind=Dimming))
     original, *variants = tiles(preview.axis_sheet(stage, "dimming", STARTER, NO_TESTS), 2)
     # Two components at five levels are all that there is.
     brightness = [variant.mean() for variant in variants[:10]]
@@ -218,8 +218,8 @@ def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyP
     assert (variants[10] == 255).all()
 
 
-def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(1, 5)))
+def test_perturbations_that_a_scene_rejects_are_grey(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preview, "configured", lambda name, config: StubAxis(kind=Lift, levels=(1, 5)))
     monkeypatch.setattr(preview, "PHYSICS_VARIANTS", 4)
     captions: list[str] = []
 
@@ -236,8 +236,8 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
         "rejected, too_high: window, level 5",
     ]
     original, *variants = tiles(sheet, 2)
-    assert [(variant == preview.REFUSED_GREY).all() for variant in variants[:4]] == [False, True, False, True]
-    # Both lifts are the same, whether the scene's model was compiled anew or not.
+    assert [(variant == preview.REJECTED_GREY).all() for variant in variants[:4]] == [False, True, False, True]
+    # Both lifts are the same, whether the scene's model was compiled again or not.
     assert not np.array_equal(variants[0], original)
     assert np.array_equal(variants[0], variants[2])
 
@@ -288,7 +288,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 @pytest.mark.slow
-def test_the_command_shows_all_axes_beside_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_shows_all_axes_next_to_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "axes.jpg"
     monkeypatch.chdir(REPOSITORY)
     monkeypatch.setattr("sys.argv", ["pipeline", "preview", f"{BOWL.suite}/{BOWL.name}", "all", "--out", str(out)])
@@ -304,10 +304,10 @@ def test_the_command_shows_all_axes_beside_the_twin(tmp_path: Path, monkeypatch:
     assert [np.abs(tile - twin).mean() > 2 for tile in (layout, pose)] == [True, True]
 
 
-def test_an_overview_shows_a_draw_of_a_middle_level_that_the_scene_takes(
+def test_an_overview_shows_a_perturbation_of_a_middle_level_that_the_scene_accepts(
     stage: preview.Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(1, 5)))
+    monkeypatch.setattr(preview, "configured", lambda name, config: StubAxis(kind=Lift, levels=(1, 5)))
     monkeypatch.setattr(preview, "PHYSICS_VARIANTS", 6)
     captions: list[str] = []
 
@@ -318,14 +318,14 @@ def test_an_overview_shows_a_draw_of_a_middle_level_that_the_scene_takes(
     monkeypatch.setattr(preview, "Tile", tile)
     preview.overview(stage, STARTER, NO_TESTS)
     assert captions[0] == f"clean twin: {BOWL.instruction}"
-    # Levels 1 and 5 are as far from 3; level 5, which comes first, is refused.
+    # Levels 1 and 5 are as far from 3; level 5, which comes first, is rejected.
     assert captions[1:] == ["lift: lamp, level 1"] * len(Axes.model_fields)
-    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(5,)))
+    monkeypatch.setattr(preview, "configured", lambda name, config: StubAxis(kind=Lift, levels=(5,)))
     captions.clear()
     preview.overview(stage, STARTER, NO_TESTS)
-    refused = {f"rejected, too_high: lift: {component}, level 5" for component in ("lamp", "window")}
+    rejected = {f"rejected, too_high: lift: {component}, level 5" for component in ("lamp", "window")}
     assert len(captions) == 1 + len(Axes.model_fields)
-    assert set(captions[1:]) <= refused
+    assert set(captions[1:]) <= rejected
     # No paraphrase of the task is of level 5, as no task of libero_90 has rewrites.
     monkeypatch.setattr(
         preview, "configured", lambda name, config: LanguageAxis(components=("paraphrase",), levels=(5,))
@@ -367,7 +367,7 @@ def of_run(name: str, twin: str, change: Perturbation | None = None, reason: str
     return row | {"component": "", "level": "1", "suite": BOWL.suite, "task": BOWL.name}
 
 
-def shown_beside_twins(rows: list[dict[str, Any]], folder: Path) -> dict[str, list[int]]:
+def shown_next_to_twins(rows: list[dict[str, Any]], folder: Path) -> dict[str, list[int]]:
     """Axis to the steps of its twin and its episode on the only pair of its sheet."""
     lengths = {"twin": 10, "push": 20, "view": 20}
     sheets.write(rows, lambda name: stills(lengths[name]), folder)
@@ -389,8 +389,8 @@ PUSH = DisturbanceAxis(first_step=((9, 9),), steps=((4, 4),)).sample(rng("sheets
 def test_sheets_show_the_pairs_of_a_run_whose_twin_is_there(reason: str, tmp_path: Path) -> None:
     rows = [of_run("twin", "twin", reason=reason), of_run("view", "twin", VIEW)]
     rows += [of_run("gone", "gone", reason="goal_not_reached"), of_run("alone", "gone", VIEW)]
-    assert shown_beside_twins(rows, tmp_path / "sheets") == {"camera": [3, 7]}
-    assert shown_beside_twins(rows[2:], tmp_path / "none") == {}
+    assert shown_next_to_twins(rows, tmp_path / "sheets") == {"camera": [3, 7]}
+    assert shown_next_to_twins(rows[2:], tmp_path / "none") == {}
 
 
 @pytest.mark.parametrize(("change", "steps"), [(START, [0, 0]), (PUSH, [9, 13])])
@@ -398,7 +398,7 @@ def test_sheets_show_a_start_at_once_and_a_push_when_it_ends(
     change: Perturbation, steps: list[int], tmp_path: Path
 ) -> None:
     rows = [of_run("twin", "twin"), of_run("push", "twin", change)]
-    assert shown_beside_twins(rows, tmp_path / "sheets") == {change.axis: steps}
+    assert shown_next_to_twins(rows, tmp_path / "sheets") == {change.axis: steps}
 
 
 def test_a_value_is_not_parted_from_its_name() -> None:
@@ -426,7 +426,7 @@ def test_a_sheet_of_a_large_run_shows_every_component_suite_and_level() -> None:
 
 
 @pytest.mark.slow
-def test_an_axis_without_a_draw_for_the_first_task_is_said_on_its_sheet(
+def test_an_axis_without_a_perturbation_for_the_first_task_is_reported_on_its_sheet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Wherever half a millimetre puts the plate, a test has it within 5 mm."""

@@ -1,4 +1,4 @@
-"""The report of a run that was really made: complete, true to the manifest, in need of nothing beside itself."""
+"""The report of a run that was really made: complete, true to the manifest, in need of no other file."""
 
 import base64
 import io
@@ -13,7 +13,7 @@ import av
 import numpy as np
 import pytest
 from conftest import REPOSITORY, tiny_config
-from html_page import Page, needs_nothing_beside_itself, screenshot
+from html_page import Page, needs_no_other_file, screenshot
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -57,8 +57,8 @@ def page(html: str) -> Page:
     return Page(html)
 
 
-def test_needs_nothing_beside_itself(html: str) -> None:
-    needs_nothing_beside_itself(html)
+def test_the_page_needs_no_other_file(html: str) -> None:
+    needs_no_other_file(html)
     assert len(html) < LIMIT_BYTES
 
 
@@ -156,7 +156,7 @@ def test_twins_that_are_left_out_are_still_shown(config: Config, finished: Path)
 
 
 def test_a_combination_counts_with_each_of_its_axes() -> None:
-    camera, light = _draw("camera", 0), _draw("light", 0)
+    camera, light = _sample("camera", 0), _sample("light", 0)
     columns = dict.fromkeys(("axis", "component", "level", "suite"), "") | {"steps": 9, "chosen": True}
     lost = {**columns, "perturbations": to_json([camera]), "kept": False, "reason": "too_dark"}
     kept = {**columns, "perturbations": to_json([camera, light]), "kept": True, "reason": "kept"}
@@ -169,7 +169,7 @@ def test_a_combination_counts_with_each_of_its_axes() -> None:
 
 def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
     light, dark = (_still(np.full((256, 256, 3), grey, np.uint8)) for grey in (200, 60))
-    clip = pages.beside([light] * 20, [dark] * 24 + [light] * 6)
+    clip = pages.show_side_by_side([light] * 20, [dark] * 24 + [light] * 6)
     frames = _video(clip)
     assert frames.shape == (30, 256, 512, 3)
     assert np.abs(frames[:, :, :250] - 200.0).max() < 8
@@ -179,27 +179,27 @@ def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
 
 def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
     noise = [_still(rng(1, frame).integers(0, 256, (256, 256, 3)).astype(np.uint8)) for frame in range(60)]
-    assert len(_content(pages.beside(noise, noise).video)) <= VIDEO_BYTES
+    assert len(_content(pages.show_side_by_side(noise, noise).video)) <= VIDEO_BYTES
 
 
 @pytest.mark.parametrize("name", sorted(AXES))
-def test_every_axis_has_a_picture_of_where_its_draws_lie(name: str) -> None:
+def test_every_axis_has_a_plot_of_its_perturbations(name: str) -> None:
     task = find_task("libero_spatial", ON_COOKIES)
-    draws = [KeptPerturbation(task, _draw(name, variant), None) for variant in range(30)]
-    shown = coverage.plot_axis(name, draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
+    kept = [KeptPerturbation(task, _sample(name, variant), None) for variant in range(30)]
+    shown = coverage.plot_axis(name, kept, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert shown.panels
     assert f"{len(benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis(name)):,}" in shown.note
     for panel in shown.panels:
         assert panel.svg.startswith("<svg")
         assert figures.colour(name) in panel.svg or "data:image/png" in panel.svg
         assert figures.INK not in panel.svg
-    # One with nothing kept, as of an axis whose replays all fail, is drawn as well.
+    # One with nothing kept, as of an axis whose replays all fail, is plotted as well.
     assert len(coverage.plot_axis(name, [], benchmark.load(REPOSITORY / benchmark.FOLDER)).panels) == len(shown.panels)
 
 
 def test_noise_stands_between_the_benchmarks_severities() -> None:
     task = find_task("libero_goal", "put_the_bowl_on_the_plate")
-    kept = [KeptPerturbation(task, _draw("noise", n), None) for n in range(100)]
+    kept = [KeptPerturbation(task, _sample("noise", n), None) for n in range(100)]
     _, (plot,) = AXES["noise"].describe_coverage(kept, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert isinstance(plot, Strips)
     assert set(plot.rows) == {"motion", "gaussian blur", "zoom", "fog", "glass"}
@@ -230,7 +230,7 @@ def test_a_browser_shows_it(html: str, width_px: int, tmp_path: Path) -> None:
     assert shown[400:, -6:].std() < 25
 
 
-def _draw(name: str, variant: int) -> Perturbation:
+def _sample(name: str, variant: int) -> Perturbation:
     task = find_task("libero_spatial", ON_COOKIES)
     return AXES[name]().sample(rng(3, name, variant), task, variant)
 

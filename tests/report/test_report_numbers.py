@@ -68,7 +68,7 @@ def test_drop_reasons_are_of_what_is_lost_and_replay_modes_of_what_is_kept() -> 
     )
 
 
-def test_own_motion_is_beside_that_of_the_twins() -> None:
+def test_own_motion_is_next_to_that_of_the_twins() -> None:
     def actions(key: str) -> Floats:
         return rng("motion", key).uniform(-1, 1, (9, 7))
 
@@ -114,7 +114,7 @@ def test_a_rewrite_stands_behind_the_original() -> None:
     assert report._rewrites([TWIN, rewritten]) == [("paraphrase, level 1", "put the bowl on the plate", said.text)]
 
 
-def test_a_draw_lies_where_its_parameters_say() -> None:
+def test_a_perturbation_is_plotted_at_its_parameters() -> None:
     nothing = np.empty((0, 2))
     camera = CameraPerturbation(component="spherical", level=1, azimuth_deg=10, elevation_deg=3, yaw_deg=4, pitch_deg=7)
     stands, _, turned = coverage.plot_axis("camera", [KeptPerturbation(BOWL, camera, None)], TestSet(())).panels

@@ -1,4 +1,4 @@
-"""What a policy sees in a run beside the benchmark's test tasks: no kind of test is missing, and the figures are so."""
+"""What a policy sees in a run next to the benchmark's test tasks: no kind of test is missing, and figures are right."""
 
 import json
 import math
@@ -42,7 +42,7 @@ def test() -> TestSet:
     return benchmark.load(REPOSITORY / benchmark.FOLDER)
 
 
-def draws(name: str, axis: Axis) -> list[Perturbation]:
+def sample_many(name: str, axis: Axis) -> list[Perturbation]:
     """Six of each task of the four suites, by the axis's defaults."""
     tasks = select_tasks([f"{suite}/*" for suite in SUITES[:4]])
     return [
@@ -51,12 +51,12 @@ def draws(name: str, axis: Axis) -> list[Perturbation]:
 
 
 @pytest.mark.parametrize("name", TOLD)
-def test_the_defaults_draw_every_kind_of_test_at_every_level(name: str, test: TestSet) -> None:
-    drawn = draws(name, AXES[name]())
+def test_the_defaults_sample_every_kind_of_test_at_every_level(name: str, test: TestSet) -> None:
+    perturbations = sample_many(name, AXES[name]())
     tested = {KINDS.get((name, task.component), task.component) for task in test.on_axis(name)}
-    assert tested <= {one.component for one in drawn}
+    assert tested <= {one.component for one in perturbations}
     for component in tested:
-        assert {one.level for one in drawn if one.component == component} == {1, 2, 3, 4, 5}, component
+        assert {one.level for one in perturbations if one.component == component} == {1, 2, 3, 4, 5}, component
 
 
 def test_a_spread_is_its_percentiles() -> None:
@@ -66,23 +66,23 @@ def test_a_spread_is_its_percentiles() -> None:
 
 def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
     entries = DemosConfig(tasks=(f"{MILK.suite}/{MILK.name}",)).index().entries
-    drawing = PlanConfig.model_validate({"seed": 3, "axes": {"pose": {}}, "episodes": {"pose": 2}, "reserve": 0.0})
-    rows = plan.make(entries, drawing, ReplayConfig(), TestSet(()))
+    plan_config = PlanConfig.model_validate({"seed": 3, "axes": {"pose": {}}, "episodes": {"pose": 2}, "reserve": 0.0})
+    rows = plan.make(entries, plan_config, ReplayConfig(), TestSet(()))
     listed = [json.loads(row.perturbations)[0]["moves"] for row in rows if row.role == "perturbed"]
-    draws = [{move["name"]: np.array([move["dx_m"], move["dy_m"]]) for move in moves} for moves in listed]
-    assert np.linalg.norm(draws[0]["milk_1"] - draws[1]["milk_1"]) > 0.03
+    moves_m = [{move["name"]: np.array([move["dx_m"], move["dy_m"]]) for move in moves} for moves in listed]
+    assert np.linalg.norm(moves_m[0]["milk_1"] - moves_m[1]["milk_1"]) > 0.03
 
     def moved(task: str, number: int, milk: Floats) -> TestTask:
-        (milk_x, milk_y), (basket_x, basket_y) = milk, draws[0]["basket_1"]
+        (milk_x, milk_y), (basket_x, basket_y) = milk, moves_m[0]["basket_1"]
         moves = f"milk_1:{milk_x},{milk_y};basket_1:{basket_x},{basket_y};ketchup_1:1,1"
         return TestTask(MILK.suite, task, f"{task}_{number}", "pose", "pose", {"moves": moves, "level": 1})
 
     away = np.array([0.006, 0.008])
     test = TestSet(
         (
-            moved(MILK.name, 1, draws[0]["milk_1"] + away),
-            moved(MILK.name, 2, draws[1]["milk_1"] + 2 * away),
-            moved(MILK.name, 3, draws[1]["milk_1"]),
+            moved(MILK.name, 1, moves_m[0]["milk_1"] + away),
+            moved(MILK.name, 2, moves_m[1]["milk_1"] + 2 * away),
+            moved(MILK.name, 3, moves_m[1]["milk_1"]),
             moved("pick_up_the_ketchup_and_place_it_in_the_basket", 1, away),
         )
     )
@@ -90,7 +90,7 @@ def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
     moving = [change for row in rows for change in from_json(row.perturbations)]
     kept: list[KeptPerturbation[Any]] = [KeptPerturbation(MILK, change, None) for change in moving]
     assert [cm for _, cm in PoseAxis.observe_together(kept, test)] == pytest.approx([1, 0, 2, 0, 0, 0])
-    between_cm = 100 * np.linalg.norm(draws[0]["milk_1"] + away - draws[1]["milk_1"] - [[0, 0], 2 * away], axis=1)
+    between_cm = 100 * np.linalg.norm(moves_m[0]["milk_1"] + away - moves_m[1]["milk_1"] - [[0, 0], 2 * away], axis=1)
     nearest_cm = [cm for what, cm in PoseAxis.observe_tests(test) if what.endswith("to its nearest placement (cm)")]
     assert nearest_cm == pytest.approx([between_cm.min(), 0, 2, 0, 2, 0])
 

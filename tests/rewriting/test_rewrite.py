@@ -258,9 +258,9 @@ def test_a_run_that_stopped_goes_on(server: Server, tmp_path: Path) -> None:
     server.replies = [*lists(2, 1), status(401, b"who are you")]
     bank = tmp_path / "bank.yaml"
     bank.write_text("# Mine.\nlibero_goal:\n  other_task:\n    paraphrase:\n    - leave this alone\n")
-    with pytest.raises(PipelineError, match=r"401.*who are you") as refusal:
+    with pytest.raises(PipelineError, match=r"401.*who are you") as rejection:
         rewrite.extend(STOVE.bddl_file, bank, 2, ask(server))
-    assert "OPENAI_API_KEY" in str(refusal.value)
+    assert "OPENAI_API_KEY" in str(rejection.value)
     before = held(bank)
     assert [len(texts) for texts in before.values()] == [2, 1, 0, 0]
     server.replies = lists(3, 1, 2, 2)[1:]
@@ -290,7 +290,7 @@ def test_rewrites_that_were_stored_during_an_answer_stay(server: Server, tmp_pat
     assert yaml.safe_load(bank.read_text())["libero_goal"]["other_task"] == {"paraphrase": ["leave this alone"]}
 
 
-def test_nothing_in_a_bank_is_refused_by_the_lint_or_said_twice(server: Server, tmp_path: Path) -> None:
+def test_nothing_in_a_bank_is_rejected_by_the_lint_or_said_twice(server: Server, tmp_path: Path) -> None:
     mixed = [SENTENCES[0], SENTENCES[0].upper() + "!", "Turn on the stove", "x", "go to /dev", *SENTENCES[1:30]]
     server.replies = [says(json.dumps(mixed))]
     bank = tmp_path / "bank.yaml"
@@ -318,7 +318,7 @@ def test_a_redirect_is_not_followed(server: Server, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("endpoint", ["localhost:8000", "file:///etc/passwd", "http://"])
-def test_what_is_no_address_is_refused(endpoint: str) -> None:
+def test_an_endpoint_that_is_no_address_is_rejected(endpoint: str) -> None:
     with pytest.raises(PipelineError, match="not an address"):
         LanguageModel(endpoint, "tiny")
 
@@ -332,7 +332,7 @@ def test_what_is_no_address_is_refused(endpoint: str) -> None:
         (None, "cannot be read"),
     ],
 )
-def test_what_is_no_task_is_refused(tmp_path: Path, text: str | None, fault: str) -> None:
+def test_a_file_that_is_no_task_is_rejected(tmp_path: Path, text: str | None, fault: str) -> None:
     file = tmp_path / "task.bddl"
     if text is not None:
         file.write_text(text)

@@ -37,7 +37,7 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-def test_a_copy_with_the_old_name_is_refused_before_anything_else(clone: Path) -> None:
+def test_a_copy_with_the_old_name_is_rejected_before_anything_else(clone: Path) -> None:
     claim_folder(Path("configs/tiny.yaml"))
     trajectory = clone / "data" / "tiny" / "trajectories" / "0123.npz"
     trajectory.parent.mkdir()
@@ -70,7 +70,7 @@ def test_dvc_s_run_must_be_where_dvc_looks(clone: Path, field: str, value: str, 
     reject_other_folder(file)
 
 
-def test_push_refuses_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_push_rejects_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     claim_folder(Path("configs/tiny.yaml"))
     shutil.copy("configs/tiny.yaml", "configs/copy.yaml")
     monkeypatch.setattr(sys, "argv", ["pipeline", "dataset", "push", "rlds", "somebody/tiny", "configs/copy.yaml"])
@@ -229,7 +229,7 @@ def test_a_file_in_place_of_the_folder_is_named(clone: Path) -> None:
         claim_folder(Path("configs/tiny.yaml"))
 
 
-def test_a_folder_inside_another_runs_is_refused(clone: Path) -> None:
+def test_a_folder_inside_another_runs_is_rejected(clone: Path) -> None:
     claim_folder(Path("configs/tiny.yaml"))
     inner = Path("configs/frames.yaml")
     shutil.copy("configs/tiny.yaml", inner)
@@ -239,7 +239,7 @@ def test_a_folder_inside_another_runs_is_refused(clone: Path) -> None:
     assert not Path("data/tiny/frames").exists()
 
 
-def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
+def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_rejected(
     clone: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shared, other, file = tmp_path_factory.mktemp("disk"), tmp_path_factory.mktemp("other"), Path("configs/tiny.yaml")
@@ -252,7 +252,7 @@ def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
 
 
 @pytest.mark.parametrize("stage", ["replay", "render"])
-def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> None:
+def test_a_plan_of_other_replay_settings_is_rejected(clone: Path, stage: str) -> None:
     """Else their replays would be stored under the ids of the settings before, and stay when these are put back."""
     config = Config.model_validate(yaml.safe_load(Path("configs/tiny.yaml").read_text()))
     rows = plan.twins(config.demos.index().entries, 0, config.replay)
@@ -264,7 +264,7 @@ def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> 
     plan.reject_other_settings(rows, config.replay)
 
 
-def test_a_plan_without_a_task_that_was_asked_for_is_refused(clone: Path) -> None:
+def test_a_plan_without_a_task_that_was_asked_for_is_rejected(clone: Path) -> None:
     """Else the other task would get its episodes, and the stage replay would delete what was finished of it."""
     link_testset(clone)
     for task in (STOVE, BOWL):
@@ -302,13 +302,13 @@ def test_one_stage_of_a_run_works_at_a_time(tmp_path: Path) -> None:
         pass
 
 
-def test_a_file_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_locks_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As Lustre answers when it is mounted without them; there, two machines would clear each other's work."""
 
-    def refuse(*_: object) -> None:
+    def reject(*_: object) -> None:
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
 
-    monkeypatch.setattr(fcntl, "flock", refuse)
+    monkeypatch.setattr(fcntl, "flock", reject)
     with pytest.raises(PipelineError, match="cannot lock a file"), locked(tmp_path):
         pass
 
@@ -342,7 +342,7 @@ def test_a_full_disk_leaves_no_half_of_the_mark(clone: Path) -> None:
     assert json.loads((clone / "data" / "tiny" / OWNER).read_text())["configuration"] == "../../configs/tiny.yaml"
 
 
-def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
+def test_a_link_in_place_of_a_runs_folder_is_rejected(clone: Path) -> None:
     """A stage deletes what it did not plan: what the link leads to may be somebody else's."""
     data = claim_folder(Path("configs/tiny.yaml")).data
     (data / "frames").symlink_to(clone / "configs")

@@ -173,9 +173,7 @@ def test_how_many_start_at_resets_and_who_makes_them_changes_none(at_resets: Pat
             assert np.array_equal(one[f"data/demo_0/{name}"], other[f"data/demo_0/{name}"])
 
 
-def test_starts_that_there_are_not_are_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_starts_are_rejected(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("sys.argv", ["pipeline", "demos", "expand", "out", "--starts", "far"])
     assert main() == 2
     assert "Invalid value for '--starts': 'far' is not one of 'wide', 'reset'" in capsys.readouterr().err

@@ -120,7 +120,7 @@ def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Confi
         assert not one.record_file.exists()
 
 
-def test_a_finished_dataset_is_made_anew_only_where_that_was_allowed(
+def test_a_finished_dataset_is_generated_again_only_where_that_was_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target, same = write_rlds(tmp_path), episodes()

@@ -1,4 +1,4 @@
-"""What lies beside a run's sets, and is none of them, is named and never deleted."""
+"""What lies next to a run's sets, and is none of them, is named and never deleted."""
 
 import re
 from pathlib import Path
@@ -18,7 +18,7 @@ RUN = Run(Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"clus
 
 
 @pytest.mark.parametrize("content", ["first", "second"], ids=["nothing to do", "another dataset to write"])
-def test_liberos_sets_beside_ours_are_refused_and_stay(content: str, tmp_path: Path) -> None:
+def test_liberos_sets_next_to_ours_are_rejected_and_stay(content: str, tmp_path: Path) -> None:
     target, elsewhere = write_rlds(tmp_path / "run"), tmp_path / "elsewhere"
     target.folder.joinpath("libero_goal_no_noops", "1.0.0").mkdir(parents=True)
     elsewhere.mkdir()
@@ -33,7 +33,7 @@ def test_liberos_sets_beside_ours_are_refused_and_stay(content: str, tmp_path: P
 
 
 @pytest.mark.parametrize("write", [write_lerobot, write_lerobot_v21])
-def test_another_lerobot_set_is_refused(write: Any, tmp_path: Path) -> None:
+def test_another_lerobot_set_is_rejected(write: Any, tmp_path: Path) -> None:
     target = write(tmp_path)
     (target.folder / "libero").mkdir()
     with pytest.raises(PipelineError, match="not of this run's LeRobot"):
@@ -53,7 +53,7 @@ def test_sets_of_the_run_are_no_foreign_ones(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("write", [write_rlds, write_lerobot, write_lerobot_v21])
 @pytest.mark.parametrize("content", ["first", "second"], ids=["nothing to do", "another dataset to write"])
-def test_a_file_inside_a_set_is_refused_and_stays(content: str, write: Any, tmp_path: Path) -> None:
+def test_a_file_inside_a_set_is_rejected_and_stays(content: str, write: Any, tmp_path: Path) -> None:
     """As a card that the user wrote, or a checkpoint that a training stored there."""
     target = write(tmp_path)
     theirs = next(path for path in target.folder.rglob("*.json")).parent / "README.md"

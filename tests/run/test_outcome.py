@@ -80,7 +80,7 @@ def test_only_what_the_export_names_counts_as_chosen(run: Outcome) -> None:
 
 @pytest.mark.parametrize("change", [{"device": "another"}, {"made_by": "another"}, {"replay_mode": "tracked"}])
 def test_other_frames_are_another_content(run: Outcome, change: dict[str, str]) -> None:
-    """By which a dataset is made anew."""
+    """By which a dataset is made again."""
     noise = run.rows[1]
     frames = {name: replace(shown, **change) for name, shown in run.frames.items()}  # type: ignore[arg-type]
     assert replace(run, frames=frames).content(noise.episode_id) != run.content(noise.episode_id)

@@ -1,4 +1,4 @@
-"""Where frames are refused, a reserve takes the place of the episode, also one that has to be replayed first."""
+"""Where frames are rejected, a reserve takes the place of the episode, also one that has to be replayed first."""
 
 from collections import Counter
 from pathlib import Path
@@ -68,7 +68,7 @@ def remains(rows: list[dict[str, Any]]) -> dict[str, list[str]]:
     return of_axis
 
 
-def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_nothing(
+def test_a_reserve_is_replayed_where_frames_are_rejected_and_a_rerun_changes_nothing(
     finished: Path, short_demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clone = tmp_path / "clone"
@@ -93,8 +93,8 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
     assert made(clone, "manifest") == ["inputs"]
     assert contents(clone) == before
 
-    # As a kill leaves it, after the refusals were stored and before the reserves had their frames: one of these has no
-    # trajectory either.
+    # As a kill leaves it, after the rejections were stored and before the reserves had their frames: one of these has
+    # no trajectory either.
     reserves = sorted(set((clone / "data/tiny/trajectories").glob("*.npz")) - replayed)
     assert len(reserves) == 2
     reserves[0].unlink()

@@ -57,7 +57,7 @@ def test_every_planned_episode_is_accounted_for(finished: Path, rows: list[dict[
     assert [row["episode_id"] for row in rows] == [row.episode_id for row in planned]
     kept = [row for row in rows if row["kept"]]
     assert {row["role"] for row in kept} == {"twin", "perturbed"}
-    # The second milk demonstration only waits: its twin is dropped, and every episode drawn on it was replaced.
+    # The second milk demonstration only waits: its twin is dropped, and every episode sampled on it was replaced.
     reasons = {row["reason"] for row in rows if not row["kept"]}
     assert "goal_not_reached" in reasons
     assert reasons <= {"goal_not_reached", "reserve_not_needed"}
@@ -383,7 +383,7 @@ def test_every_format_gets_rewrites_and_subtasks(
     monkeypatch.chdir(finished.parents[1])
     config = load(Path("configs/tiny.yaml"))
     plain = LeRobot(config.data, config.export.options_for(LeRobot) or LeRobotConfig())
-    # Where lerobot is older, reading a configuration refuses it.
+    # Where lerobot is older, reading a configuration rejects it.
     told = LeRobot(config.data, plain.options.model_copy(update={"language": True}))
     episodes, given = (episodes_of(target, Run(config)) for target in (plain, told))
     assert {one.content for one in given.facts.values()} == {one.content for one in episodes.facts.values()}

@@ -91,7 +91,7 @@ def test_a_stage_that_is_called_alone_makes_again_what_was_deleted(
         assert file.read_bytes() == before, stage
 
 
-def test_a_second_run_of_one_folder_is_refused(tmp_path: Path, short_demos: Path) -> None:
+def test_a_second_run_of_one_folder_is_rejected(tmp_path: Path, short_demos: Path) -> None:
     """While the first works, which a lock of the folder shows."""
     file = tmp_path / "first.yaml"
     file.write_text(yaml.safe_dump(noise_config("first", 1, short_demos)))

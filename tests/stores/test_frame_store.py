@@ -1,4 +1,4 @@
-"""A plan has the frames of a first run whatever was there before, and finished work is not made anew unasked."""
+"""A plan has the frames of a first run whatever was there before, and finished work is not made again unasked."""
 
 import json
 import shutil
@@ -82,7 +82,7 @@ def next_recipe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[identity.
 
 
 @pytest.mark.parametrize("step", ["physics", "pixels"])
-def test_finished_work_is_made_anew_only_where_that_was_allowed(
+def test_finished_work_is_generated_again_only_where_that_was_allowed(
     step: identity.Step,
     config: Config,
     rows: list[plan.Row],
@@ -140,7 +140,7 @@ def without_twins(rows: Sequence[plan.Row]) -> list[plan.Row]:
 def test_rendering_ends_when_all_streams_of_a_trajectory_are_rejected(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every frame under a changed light counts as too dark: LIBERO's head light keeps real draws from being so."""
+    """Every frame under a changed light counts as too dark: LIBERO's head light prevents this otherwise."""
     monkeypatch.setattr("pipeline.rendering.sight.exposure", lambda frame: "too_dark")
     lights = without_twins(rows)
     assert len(lights) == 2
@@ -313,10 +313,10 @@ def test_states_are_those_of_the_replay_where_a_worker_was_lost_over_other_strea
     np.testing.assert_array_equal(made.state[:, 6:], states[:-1, 8:10].astype(np.float32))
 
 
-def test_a_refusal_of_a_reserve_that_is_no_longer_needed_is_forgotten(
+def test_a_rejection_of_a_reserve_that_is_no_longer_needed_is_forgotten(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
 ) -> None:
-    """As when the refused frames before it are deleted, to be tried again."""
+    """As when the rejected frames before it are deleted, to be tried again."""
     store = FrameStore(tmp_path, config.render)
     expected = render_into(tmp_path, rows, config, replayed, loop)
     store.keep(())

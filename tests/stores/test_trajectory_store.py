@@ -79,13 +79,13 @@ def test_quality_is_stored_and_a_filter_drops_by_it(config: Config, rows: list[p
     assert verdicts_of(store.rows(), rows, FilterConfig()) == {name: Verdict(True, "kept")}
     for column, figure in figures.items():
         if column == "joint_margin_rad":
-            refusing, letting = figure + 0.01, figure
+            rejecting, accepting = figure + 0.01, figure
         else:
-            refusing, letting = figure * 0.99, figure
+            rejecting, accepting = figure * 0.99, figure
         if figure > 0:
-            refused = verdicts_of(store.rows(), rows, FilterConfig(**{column: refusing}))
-            assert refused == {name: Verdict(False, column)}
-        assert verdicts_of(store.rows(), rows, FilterConfig(**{column: letting}))[name].kept
+            rejected = verdicts_of(store.rows(), rows, FilterConfig(**{column: rejecting}))
+            assert rejected == {name: Verdict(False, column)}
+        assert verdicts_of(store.rows(), rows, FilterConfig(**{column: accepting}))[name].kept
 
     limits = FilterConfig(path_m=figures["path_m"] / 2)
     judged = Replays(config.demos, config.replay, TrajectoryStore(whole_replay), nothing_to_do, limits).complete(rows)
@@ -221,7 +221,7 @@ def test_a_changed_number_is_not_read(trajectories: Path, name: str) -> None:
 
 
 def test_no_flipped_bit_is_read(trajectories: Path) -> None:
-    """Either the file is refused, or what is read is what was written."""
+    """Either the file is rejected, or what is read is what was written."""
     file = next(trajectories.glob("*.npz"))
     store = TrajectoryStore(trajectories)
     loaded = store.load(file.stem)

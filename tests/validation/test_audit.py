@@ -233,7 +233,7 @@ def test_the_command_ends_with_1_where_something_overlaps(
     assert said["axes"]["camera"]["overlaps"] == 1
 
 
-def test_a_folder_without_a_dataset_is_refused(tmp_path: Path, test: TestSet) -> None:
+def test_a_folder_without_a_dataset_is_rejected(tmp_path: Path, test: TestSet) -> None:
     with pytest.raises(PipelineError, match="no dataset below this folder"):
         audit(tmp_path, test)
 

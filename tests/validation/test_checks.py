@@ -62,9 +62,9 @@ def test_frames_of_another_motion_than_the_replays_are_found() -> None:
 
 
 def test_a_rewrite_that_no_bank_has_is_found() -> None:
-    (drawn, *_) = list_rewrites(BOWL)
+    (rewrite, *_) = list_rewrites(BOWL)
     strange = LanguagePerturbation(component="paraphrase", level=1, text="move the bowl over to the plate at last")
-    for change, found in ((drawn, []), (strange, [f"rewrite {strange.text!r} is not in the bank"])):
+    for change, found in ((rewrite, []), (strange, [f"rewrite {strange.text!r} is not in the bank"])):
         row = {"suite": BOWL.suite, "task": BOWL.name, "perturbations": to_json([change]), "instruction": change.text}
         assert [fault.what for fault in CHECKS["wording"](case(**row))] == found
 

@@ -54,7 +54,7 @@ def checked(root: Path, replays: int = 0, **replay: object) -> CheckedDemos:
     return check(root, replays, loop, ReplayConfig.model_validate(replay))
 
 
-def test_good_files_pass_and_a_miss_beside_a_success_is_listed(good: Path) -> None:
+def test_good_files_pass_and_a_miss_next_to_a_success_is_listed(good: Path) -> None:
     waiting = [f"{task.suite}/{task.name}/demo_1" for task in (BOWL, STOVE)]
     assert checked(good, replays=2) == CheckedDemos(files=2, demonstrations=4, replayed=4, missed=waiting)
     assert checked(good, replays=1) == CheckedDemos(files=2, demonstrations=4, replayed=2)

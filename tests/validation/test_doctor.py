@@ -145,7 +145,7 @@ def test_disk_is_asked_for_as_runs_took_it(asked: Any, took: dict[str, float]) -
 
 @pytest.mark.slow
 def test_disk_is_asked_for_as_a_run_takes_it(finished: Path) -> None:
-    """Of ten steps and more an episode, of which each has much beside its steps."""
+    """Of ten steps and more an episode, of which each has much in addition to its steps."""
     needs = needed_mb(load(finished.parent.parent / "configs" / "tiny.yaml"))
     for folder in ("trajectories", "frames", "rlds", "lerobot"):
         mb = sum(file.stat().st_size for file in (finished / folder).rglob("*") if file.is_file()) / 1e6
@@ -245,7 +245,7 @@ def test_another_version_than_the_pinned_one(monkeypatch: pytest.MonkeyPatch, tm
     assert "setup.sh" in found[package].remedy
 
 
-def test_tensorflow_beside_the_renderer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_tensorflow_in_one_process_with_the_renderer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "tensorflow").mkdir()
     (tmp_path / "tensorflow" / "__init__.py").write_text("raise RuntimeError('imported')")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -290,7 +290,7 @@ def stored(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_a_speed_that_another_version_wrote_is_measured_anew(tmp_path: Path) -> None:
+def test_a_speed_that_another_version_wrote_is_measured_again(tmp_path: Path) -> None:
     run = run_in(tmp_path)
     machine.keep_speed(run, REFERENCE)
     assert machine.known_speed(run) == REFERENCE

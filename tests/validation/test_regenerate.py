@@ -107,7 +107,7 @@ def test_without_the_dataset_it_is_only_made_and_says_so(
     assert list((tmp_path / "out" / "rlds").rglob("*.tfrecord-*"))
 
 
-def test_refuses_what_cannot_be_made(copy: Path, short_demos: Path, tmp_path: Path) -> None:
+def test_impossible_requests_are_rejected(copy: Path, short_demos: Path, tmp_path: Path) -> None:
     file, out = copy / "manifest.parquet", tmp_path / "out"
     dropped = next(row["episode_id"] for row in manifest.read(file) if row["reason"] == "goal_not_reached")
     made = perturbed(copy)["episode_id"]

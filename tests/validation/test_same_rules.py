@@ -1,4 +1,4 @@
-"""What `validate` would refuse at the end of a run is refused where a task, a rewrite or a demonstration is read."""
+"""What `validate` would reject at the end of a run is rejected where a task, a rewrite or a demonstration is read."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ from pipeline.validation.demonstrations import check
 
 BOWL = find_task("libero_goal", "put_the_bowl_on_the_plate")
 
-REFUSED = {
+REJECTED = {
     "put the 2nd bowl on the plate": "2",
     "put the bowl/cup on the plate": "/",
     "put the_bowl on the plate": "_",
@@ -48,7 +48,7 @@ def recorded(folder: Path, gripper: float = 1.0) -> None:
     hdf5.write(folder, BOWL, [hdf5.Recording(actions, states, states[:, :9], "<mujoco/>", {})])
 
 
-@pytest.mark.parametrize(("instruction", "named"), REFUSED.items())
+@pytest.mark.parametrize(("instruction", "named"), REJECTED.items())
 def test_a_task_of_ones_own(instruction: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     definition = tmp_path / "tasks" / "my_suite" / "bowl_away.bddl"
@@ -68,14 +68,14 @@ def test_a_task_of_ones_own(instruction: str, named: str, tmp_path: Path, monkey
 
 def worded(task: Task, text: str, bank: Path | None = None) -> list[str]:
     """What `validate` finds wrong with an instruction; of a bank, it is one of its rewrites."""
-    drawn = [one for one in list_rewrites(task, bank=bank) if one.text == text] if bank else []
-    row = {"suite": task.suite, "task": task.name, "instruction": text, "perturbations": to_json(drawn)}
+    rewrites = [one for one in list_rewrites(task, bank=bank) if one.text == text] if bank else []
+    row = {"suite": task.suite, "task": task.name, "instruction": text, "perturbations": to_json(rewrites)}
     case: Any = SimpleNamespace(row=row, task=task, bank=bank, finding=lambda *told: told[1])
     found: Any = checks.wording(case)
     return list(found)
 
 
-@pytest.mark.parametrize(("text", "named"), [*REFUSED.items(), *dict.fromkeys(TAKEN).items()])
+@pytest.mark.parametrize(("text", "named"), [*REJECTED.items(), *dict.fromkeys(TAKEN).items()])
 def test_a_rewrite_of_ones_own(text: str, named: str | None, tmp_path: Path) -> None:
     if named:
         assert lint(text, BOWL, "distraction") == "file-name debris"

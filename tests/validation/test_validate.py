@@ -131,7 +131,7 @@ EXPECTED = {
     ("instruction", "lerobot", "other"),
     ("counts", "manifest", None),  # counts.json has one camera episode more.
 }
-"""Check, dataset and episode of all that is to be found, whichever episodes are rendered anew."""
+"""Check, dataset and episode of all that is to be found, whichever episodes are rendered again."""
 
 OTHER_FRAMES = {
     **{("camera", STOVE): "rlds", ("clean", BOWL): "rlds", ("noise", BOWL): "rlds"},

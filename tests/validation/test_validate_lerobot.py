@@ -54,7 +54,7 @@ def with_v21(finished: Path) -> Config:
 
 
 def checked(version: str, config: Config) -> dict[str, list[Fault]]:
-    """What is found in one dataset, by check; nothing is rendered anew."""
+    """What is found in one dataset, by check; nothing is rendered again."""
     run = Run(config).resolved()
     data = run.folder
     kept = {row["episode_id"]: row for row in manifest.read(data / "manifest.parquet") if row["kept"]}
@@ -192,7 +192,7 @@ def test_language_columns_are_held_against_what_was_to_be_written(
     config = load(finished.parent.parent / "configs" / "tiny.yaml")
     options = config.export.options_for(LeRobot)
     assert options is not None
-    # Before 0.6, lerobot cannot read it and a configuration that asks for it is refused; here lerobot is not asked.
+    # Before 0.6, lerobot cannot read it and a configuration that asks for it is rejected; here lerobot is not asked.
     told = options.model_copy(update={"language": True})
     config = config.model_copy(update={"export": config.export.model_copy(update={"lerobot": told})})
     monkeypatch.chdir(tmp_path)

@@ -322,7 +322,7 @@ class Schedule:
         return (1 + math.cos(math.pi * min(done, 1.0))) / 2
 
 
-def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, anew: bool = False) -> Schedule:
+def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, restart: bool = False) -> Schedule:
     """Return the recipe's schedule with the steps, the warm-up and the resumed step from OFT's arguments.
 
     Args:
@@ -330,10 +330,10 @@ def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, anew: 
         steps: the recipe's number of steps, used without ``--max_steps``.
         warmup_steps: the recipe's number of warm-up steps. Without ``--lr_warmup_steps``, the schedule has the
             recipe's ratio of warm-up steps to steps.
-        anew: True if the resumed checkpoint comes from another training, so that the schedule begins with it.
+        restart: True if the resumed checkpoint comes from another training, so that the schedule begins with it.
 
     Raises:
-        SystemExit: with a message, if ``anew`` is set but nothing is resumed, or if OFT would never stop.
+        SystemExit: with a message, if ``restart`` is set but nothing is resumed, or if OFT would never stop.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--max_steps", type=int, default=steps)
@@ -343,7 +343,7 @@ def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, anew: 
     parser.add_argument("--resume_step", type=int, default=0)
     given, _ = parser.parse_known_args(words)
     first = given.resume_step if given.resume else 0
-    if anew and not first:
+    if restart and not first:
         sys.exit(
             "error: --statistics without --resume: OFT would begin with a new action head\n"
             "  try: --vla_path CHECKPOINT --resume True --resume_step STEP --max_steps STEP+N"
@@ -353,9 +353,9 @@ def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, anew: 
             f"error: --resume_step {first} is not below --max_steps {given.max_steps}, at which OFT stops\n"
             f"  try: --max_steps {first + steps} for {steps} more"
         )
-    steps_here = given.max_steps - first if anew else given.max_steps
+    steps_here = given.max_steps - first if restart else given.max_steps
     warmup = steps_here * warmup_steps // steps if given.lr_warmup_steps is None else given.lr_warmup_steps
-    return Schedule(steps_here, warmup, 0 if anew else first)
+    return Schedule(steps_here, warmup, 0 if restart else first)
 
 
 def set_optimiser(weight_decay: float, schedule: Schedule) -> None:
@@ -417,7 +417,7 @@ def prepare() -> None:
     suite_of = {name: suite for suite, name in suites.items()}
     suite_of |= {name: name.removesuffix("_no_noops") for name in added}
     schedule = read_schedule(
-        given, training["steps"]["value"], training["warmup_steps"]["value"], anew=options.statistics is not None
+        given, training["steps"]["value"], training["warmup_steps"]["value"], restart=options.statistics is not None
     )
     # OFT derives its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" in the arguments.
     # If a flag is given twice, its last value counts.

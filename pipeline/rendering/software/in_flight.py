@@ -9,8 +9,8 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import calls, check
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.types import Frame
 
 BUFFERS = 8
@@ -84,7 +84,7 @@ class PixelBuffers:
         return np.ascontiguousarray(pixels[..., :3])
 
 
-class InFlightDrawing(PlainDrawing):
+class InFlightRenderer(PlainRenderer):
     """Plain rendering whose frames are in flight between ``start_frame`` and the wait for them.
 
     Raises:
@@ -99,9 +99,9 @@ class InFlightDrawing(PlainDrawing):
         return PixelBuffers(self._context, BUFFERS, self.size_px)
 
     def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
-        """Start to render a frame; see ``PlainDrawing``. Up to ``BUFFERS`` frames are in flight at a time."""
+        """Start to render a frame; see ``PlainRenderer``. Up to ``BUFFERS`` frames are in flight at a time."""
         self._gl.make_current()
-        self._draw(data, camera)
+        self._render_frame(data, camera)
         number = self._buffers.start_copy()
 
         def wait() -> Frame:

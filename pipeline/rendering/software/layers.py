@@ -4,11 +4,11 @@ A GPU renders a face in less time than a process takes to choose it, so meshes a
 leave out whole geoms, which takes less of the processes' time.
 """
 
-from pipeline.rendering.software.drawing import SoftwareDrawing
-from pipeline.rendering.software.in_flight import InFlightDrawing
+from pipeline.rendering.software.in_flight import InFlightRenderer
+from pipeline.rendering.software.software_renderer import SoftwareRenderer
 
 
-class LayersDrawing(InFlightDrawing, SoftwareDrawing):
+class LayeredRenderer(InFlightRenderer, SoftwareRenderer):
     """Rendering with frames in flight, culling and underlays, of models that are ``possible``.
 
     Raises:

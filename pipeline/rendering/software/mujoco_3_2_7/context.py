@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rendering.drawing import texels
 from pipeline.rendering.opengl import calls, check
+from pipeline.rendering.plain_renderer import texels
 
 SKINS = 64
 """Number of skins with texture coordinates, and of skins without; LIBERO's scenes have up to 50 large meshes."""

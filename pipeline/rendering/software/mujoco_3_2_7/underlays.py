@@ -60,7 +60,7 @@ class Underlay:
         self._ties: int = np.atleast_1d(opengl.glGenQueries(1)).tolist()[0]
         self.number = calls().glGenLists(1)
         with recorded(self.number):
-            self._draw()
+            self._write()
         self.content = b""
 
     def keep(self, content: bytes) -> None:
@@ -86,7 +86,7 @@ class Underlay:
         """Return the number of samples at which the last picture over the underlay had another geom of equal depth."""
         return int(calls().glGetQueryObjectuiv(self._ties, calls().GL_QUERY_RESULT))
 
-    def _draw(self) -> None:
+    def _write(self) -> None:
         """Write the kept colour and depth into the current buffer."""
         opengl = calls()
         opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)

@@ -16,9 +16,9 @@ from pipeline.axes import Perturbation, to_json
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.errors import PipelineError
-from pipeline.evaluation import own_draws
+from pipeline.evaluation import held_out
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw
+from pipeline.evaluation.held_out import OWN_AXES, PlannedPerturbations, sample_perturbation
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
@@ -34,18 +34,19 @@ def planned_row(task: EvaluationTask, *perturbations: Perturbation) -> plan.Row:
 
 
 @pytest.mark.parametrize("axis", OWN_AXES)
-def test_a_planted_copy_of_a_held_out_draw_is_found(axis: str) -> None:
+def test_a_planted_copy_of_a_held_out_perturbation_is_found(axis: str) -> None:
     tasks = select(Selection(source="own", suites=(STOVE.suite,), tasks=("put_the_bowl_on_the_plate",), axes=(axis,)))
     base = find_task(tasks[0].suite, tasks[0].base)
-    drawn = [(task.name, draw(task, 0), base) for task in tasks]
-    (found,) = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], drawn[2][1])])).values()
+    sampled = [(task.name, sample_perturbation(task, 0), base) for task in tasks]
+    (found,) = held_out.compare(sampled, PlannedPerturbations([planned_row(tasks[2], sampled[2][1])])).values()
     assert found["overlaps"] >= 1
     assert found["smallest"] == 0
     assert found["closest"] == (tasks[2].name, "planted")
-    other = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], draw(tasks[2], 1))]))[axis]
+    planned = PlannedPerturbations([planned_row(tasks[2], sample_perturbation(tasks[2], 1))])
+    other = held_out.compare(sampled, planned)[axis]
     assert other["draws"] == 5
     assert other["planned"] == 1
-    assert own_draws.compare(drawn, PlannedDraws([]))[axis]["smallest"] is None
+    assert held_out.compare(sampled, PlannedPerturbations([]))[axis]["smallest"] is None
 
 
 def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
@@ -53,8 +54,8 @@ def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
     effects = [effect for name in ("motion", "gaussian_blur", "zoom", "fog", "glass") for effect in getattr(axis, name)]
     trained = [NoisePerturbation(component=effect.component, effect=effect, level=1, seed=0) for effect in effects]
     tasks = select(Selection(source="own", axes=("noise",), episodes=2))
-    planned = PlannedDraws([planned_row(tasks[0], one) for one in trained])
-    found = own_draws.compare(((task.name, draw(task, 0), STOVE) for task in tasks), planned)["noise"]
+    planned = PlannedPerturbations([planned_row(tasks[0], one) for one in trained])
+    found = held_out.compare(((task.name, sample_perturbation(task, 0), STOVE) for task in tasks), planned)["noise"]
     assert found["overlaps"] == 0
     assert found["smallest"] is not None
     assert found["smallest"] >= found["clearance"]
@@ -63,39 +64,42 @@ def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
 def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tasks = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot", "light")))
     for task in tasks:
-        recorded = json.loads(to_json([draw(task, 0)]))
+        recorded = json.loads(to_json([sample_perturbation(task, 0)]))
         EpisodeFiles(tmp_path).save(result(task, perturbations=recorded))
     config = tmp_path / "mine.yaml"
     config.write_text(f"name: mine\nfolder: {tmp_path}\nplan:\n  episodes: {{robot: 1}}\n")
     file = tmp_path / "mine" / "plan.parquet"
     file.parent.mkdir()
-    plan.write([planned_row(tasks[0], draw(tasks[0], 0))], file)
+    plan.write([planned_row(tasks[0], sample_perturbation(tasks[0], 0))], file)
     assert analyze("leakage", str(tmp_path), str(config)) == 1
     printed = json.loads(capsys.readouterr().out)
     assert (printed["robot"]["overlaps"], printed["light"]["overlaps"]) == (1, 0)
-    plan.write([planned_row(tasks[0], draw(tasks[0], 1))], file)
+    plan.write([planned_row(tasks[0], sample_perturbation(tasks[0], 1))], file)
     assert analyze("leakage", str(tmp_path), str(config)) == 0
 
 
-def test_language_has_no_held_out_draws_and_says_what_else_there_is() -> None:
+def test_language_has_no_held_out_perturbations_and_names_the_alternative() -> None:
     with pytest.raises(PipelineError, match="language has no held-out perturbations") as caught:
         select(Selection(source="own", axes=("language",)))
     assert "--source libero_plus --axis language" in str(caught.value)
 
 
 @pytest.mark.slow
-def test_draws_that_a_plan_has_are_drawn_anew(tmp_path: Path) -> None:
+def test_perturbations_that_a_plan_has_are_sampled_again(tmp_path: Path) -> None:
     task = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("camera",), levels=(3,)))[0]
     file = tmp_path / "plan.parquet"
-    plan.write([planned_row(task, draw(task, 0))], file)
+    plan.write([planned_row(task, sample_perturbation(task, 0))], file)
     settings = EpisodeSettings(plan=file)
-    assert settings.model_dump()["plan"] == own_draws.sha256_of(file)
+    assert settings.model_dump()["plan"] == held_out.sha256_of(file)
     assert "plan" not in EpisodeSettings().model_dump()
     environment = EpisodeEnvironment(settings)
     environment.reset(task)
     (used,) = environment.perturbations
-    assert used == draw(task, 0, attempt=1)
-    plan.write([planned_row(task, draw(task, 0, attempt=attempt)) for attempt in range(20)], tmp_path / "all.parquet")
+    assert used == sample_perturbation(task, 0, attempt=1)
+    plan.write(
+        [planned_row(task, sample_perturbation(task, 0, attempt=attempt)) for attempt in range(20)],
+        tmp_path / "all.parquet",
+    )
     environment.settings = EpisodeSettings(plan=tmp_path / "all.parquet")
     progress = environment.reset(task)
     assert (progress.over, progress.success, progress.reason) == (True, False, "refused")
@@ -122,7 +126,7 @@ def pixels_of(things: Sequence[str], camera: Perturbation, environment: EpisodeE
 
 @pytest.mark.slow
 def test_a_held_out_camera_that_does_not_show_what_the_task_is_about_is_sampled_again() -> None:
-    """The first draw of this task has the right plate outside of the frame, and was evaluated."""
+    """The first sample of this task has the right plate outside of the frame, and was evaluated."""
     name = "LIVING_ROOM_SCENE5_put_the_white_mug_on_the_left_plate_and_put_the_yellow_and_white_mug_on_the_right_plate"
     (task,) = select(Selection(source="own", suites=("libero_10",), tasks=(name,), axes=("camera",), levels=(5,)))
     environment = EpisodeEnvironment()
@@ -130,10 +134,10 @@ def test_a_held_out_camera_that_does_not_show_what_the_task_is_about_is_sampled_
     assert progress.reason == "running"
     (used,) = environment.perturbations
     environment.image("agentview")  # which sets OpenGL up
-    assert pixels_of(["plate_2"], draw(task, 0), environment) == [0]
-    assert used != draw(task, 0)
+    assert pixels_of(["plate_2"], sample_perturbation(task, 0), environment) == [0]
+    assert used != sample_perturbation(task, 0)
     assert (used.axis, used.level) == ("camera", 5)
-    assert used in [draw(task, 0, attempt) for attempt in range(own_draws.ATTEMPTS)]
+    assert used in [sample_perturbation(task, 0, attempt) for attempt in range(held_out.ATTEMPTS)]
     things = ("porcelain_mug_1", "white_yellow_mug_1", "plate_1", "plate_2")
     assert min(pixels_of(things, used, environment)) >= 20
     environment.close()

@@ -34,7 +34,7 @@ ATTEMPTS = 20
 """Number of samples per axis of a task; a sample is rejected by its scene, by its visibility, or by a plan."""
 
 
-def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
+def held_out_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
     """Return a LIBERO task with a held-out perturbation.
 
     Return `None` if one of the axes cannot change anything in the task.
@@ -44,15 +44,15 @@ def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> Eva
         number: number of the perturbation among those of the same task, axis and level.
     """
     names = axes_of(axis)
-    if not all(held_out(name).applies(task) for name in names):
+    if not all(held_out_axis(name).applies(task) for name in names):
         return None
     task_name = f"{task.name}_{axis}_level{level}_draw{number}"
-    drawn = EvaluationTask("own", task.suite, task.name, task_name, axis, "", level, number)
-    components = [draw(drawn, seed, axis=name).component for name in names]
-    return replace(drawn, component="+".join(components))
+    evaluation_task = EvaluationTask("own", task.suite, task.name, task_name, axis, "", level, number)
+    components = [sample_perturbation(evaluation_task, seed, axis=name).component for name in names]
+    return replace(evaluation_task, component="+".join(components))
 
 
-def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> Perturbation:
+def sample_perturbation(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> Perturbation:
     """Sample the perturbation of a task on one axis.
 
     The random key begins with ``evaluation``. No plan's key does, so no seed gives a plan the same perturbations. The
@@ -64,30 +64,30 @@ def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> P
     """
     name = axis or task.axis
     key = seeding.rng("evaluation", seed, name, task.suite, task.base, task.level, task.number, attempt)
-    ranges = held_out(name).model_copy(update={"levels": (task.level,)})
+    ranges = held_out_axis(name).model_copy(update={"levels": (task.level,)})
     return ranges.sample(key, find_task(task.suite, task.base), task.number)
 
 
-def first_draws(task: EvaluationTask, seed: int) -> str:
+def digest_first_perturbations(task: EvaluationTask, seed: int) -> str:
     """Compute a digest of a task's first perturbation on each axis.
 
     Another version of this project compares the digest to detect that it samples different perturbations.
     """
-    return digest(to_json(draw(task, seed, axis=axis) for axis in axes_of(task.axis)))[:16]
+    return digest(to_json(sample_perturbation(task, seed, axis=axis) for axis in axes_of(task.axis)))[:16]
 
 
 @cache
-def held_out(name: str) -> Axis:
+def held_out_axis(name: str) -> Axis:
     """Return the ranges of an axis's held-out perturbations."""
     return AXES[name].held_out()
 
 
-def drawn_scene(
+def held_out_scene(
     task: EvaluationTask,
     seed: int,
     demo: Demo,
     nominal: Callable[[], Scene],
-    planned: PlannedDraws | None,
+    planned: PlannedPerturbations | None,
     opened: LastScene,
 ) -> tuple[tuple[Perturbation, ...], Scene | None]:
     """Sample the perturbations of a task, and return them with the perturbed scene.
@@ -112,7 +112,7 @@ def drawn_scene(
     perturbations: list[Perturbation] = []
     scene = None
     for axis in axes_of(task.axis):
-        samples = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
+        samples = (sample_perturbation(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
         far_from_plan = (sample for sample in samples if planned is None or not planned.overlap(sample, demo.task))
         perturbation, moved = _first_accepted(far_from_plan, axis, demo, nominal, opened)
         if isinstance(perturbation, PhysicsPerturbation):
@@ -155,7 +155,7 @@ def _scene_with(
     return scene
 
 
-class PlannedDraws:
+class PlannedPerturbations:
     """Perturbations of a plan, with which held-out perturbations are compared.
 
     Distances are those of the leakage report, with the plan in place of the benchmark's test tasks.
@@ -165,7 +165,7 @@ class PlannedDraws:
     """
 
     def __init__(self, rows: Iterable[plan.Row]):
-        self._draws: dict[Hashable, list[tuple[Perturbation, str]]] = defaultdict(list)
+        self._perturbations: dict[Hashable, list[tuple[Perturbation, str]]] = defaultdict(list)
         self.counts = Counter[str]()
         """Axis to the number of its perturbations."""
         self.goals: set[Hashable] = set()
@@ -176,36 +176,36 @@ class PlannedDraws:
                 self.goals.add(definition_of(task).asked)
             for perturbation in from_json(row.perturbations):
                 key = _comparable(perturbation, task)
-                self._draws[key].append((perturbation.in_scene(task), row.episode_id))
+                self._perturbations[key].append((perturbation.in_scene(task), row.episode_id))
                 self.counts[perturbation.axis] += 1
 
-    def nearest(self, drawn: Perturbation, task: Task) -> tuple[float, str]:
+    def nearest(self, sampled: Perturbation, task: Task) -> tuple[float, str]:
         """Return the distance to the nearest planned perturbation on the same axis, and its episode.
 
         If the plan has nothing to compare with, the distance is infinite and the episode is empty.
         """
-        comparable = self._draws.get(_comparable(drawn, task), [])
+        comparable = self._perturbations.get(_comparable(sampled, task), [])
         if not comparable:
             return math.inf, ""
-        distances = drawn.in_scene(task).distances_to([perturbation for perturbation, _ in comparable])
+        distances = sampled.in_scene(task).distances_to([perturbation for perturbation, _ in comparable])
         if not np.isfinite(distances).any():
             return math.inf, ""
         closest = int(np.nanargmin(distances))
         _, episode = comparable[closest]
         return float(distances[closest]), episode
 
-    def overlap(self, drawn: Perturbation, task: Task) -> bool:
+    def overlap(self, sampled: Perturbation, task: Task) -> bool:
         """Return whether a perturbation equals a planned one or is closer to one than the axis's clearance."""
-        distance, _ = self.nearest(drawn, task)
-        return distance == 0 or distance < drawn.clearance
+        distance, _ = self.nearest(sampled, task)
+        return distance == 0 or distance < sampled.clearance
 
 
-def _comparable(drawn: Perturbation, task: Task) -> Hashable:
+def _comparable(perturbation: Perturbation, task: Task) -> Hashable:
     """Return a key that is equal for perturbations between which a distance is defined."""
-    return type(drawn), drawn.same and shared(task, drawn.same)
+    return type(perturbation), perturbation.same and shared(task, perturbation.same)
 
 
-def planned(file: Path) -> PlannedDraws:
+def planned(file: Path) -> PlannedPerturbations:
     """Read the perturbations of a plan's file, once per process.
 
     Raises:
@@ -215,9 +215,9 @@ def planned(file: Path) -> PlannedDraws:
 
 
 @cache
-def _planned(file: Edition) -> PlannedDraws:
+def _planned(file: Edition) -> PlannedPerturbations:
     """Read the perturbations of one edition of a plan's file."""
-    return PlannedDraws(plan.read(file.path))
+    return PlannedPerturbations(plan.read(file.path))
 
 
 def sha256_of(file: Path) -> str:
@@ -243,11 +243,13 @@ def _edition(file: Path) -> Edition:
         ) from error
 
 
-def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:
+def compare(
+    sampled: Iterable[tuple[str, Perturbation, Task]], planned_perturbations: PlannedPerturbations
+) -> dict[str, Any]:
     """Compare held-out perturbations with a plan.
 
     Args:
-        drawn: name, perturbation and perturbed task of each held-out perturbation.
+        sampled: name, perturbation and perturbed task of each held-out perturbation.
 
     Returns:
         Axis to a dictionary with these keys:
@@ -260,16 +262,16 @@ def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: Plan
         * ``clearance``: the least distance that the leakage report allows.
     """
     by_axis = {}
-    for axis, draws in grouped((named[1].axis, named) for named in drawn).items():
-        distances = [(*planned_draws.nearest(perturbation, task), name) for name, perturbation, task in draws]
+    for axis, of_axis in grouped((named[1].axis, named) for named in sampled).items():
+        distances = [(*planned_perturbations.nearest(perturbation, task), name) for name, perturbation, task in of_axis]
         smallest, episode, name = min(distances)
         compared = math.isfinite(smallest)
         by_axis[axis] = {
-            "draws": len(draws),
-            "planned": planned_draws.counts[axis],
-            "overlaps": sum(planned_draws.overlap(perturbation, task) for _, perturbation, task in draws),
+            "draws": len(of_axis),
+            "planned": planned_perturbations.counts[axis],
+            "overlaps": sum(planned_perturbations.overlap(perturbation, task) for _, perturbation, task in of_axis),
             "smallest": smallest if compared else None,
             "closest": (name, episode) if compared else None,
-            "clearance": draws[0][1].clearance,
+            "clearance": of_axis[0][1].clearance,
         }
     return by_axis

@@ -1,4 +1,4 @@
-"""Rendering of the pixels of ``PlainDrawing`` with less work for Mesa, and of successive scenes in one context.
+"""Rendering of the pixels of ``PlainRenderer`` with less work for Mesa, and of successive scenes in one context.
 
 * Geoms outside of the view are not rendered (``culling.py``).
 * Large meshes are rendered only by their faces that cover a sample (``skins.py``, ``samples.py``).
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.axes.base import FIELDS
 from pipeline.episode_schema import SIZE_PX
-from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.software.culling import Culling, Picture
 from pipeline.rendering.software.mujoco_3_2_7 import context as private
 from pipeline.rendering.software.mujoco_3_2_7.meshes import Meshes
@@ -71,7 +71,7 @@ class Still:
             self._view, self._places = view, places
             self._geoms: NDArray[np.bool_] = np.zeros(len(places), np.bool_)
             self._age: NDArray[np.intp] = np.zeros(len(places), np.intp)
-            self._beside = 0
+            self._extra_faces = 0
             return self._geoms
         stood_still = (places == self._places).all(axis=1)
         self._places = places
@@ -79,13 +79,13 @@ class Still:
         self._wait[leaving] = np.minimum(2 * self._wait[leaving], LONGEST_WAIT)
         self._age = np.where(stood_still, self._age + 1, 0)
         ready = rendered & (self._age >= self._wait)
-        self._beside += int(self._faces[ready & ~self._geoms].sum())
-        if leaving.any() or self._beside > self._faces[ready].sum():
-            self._geoms, self._beside = ready, 0
+        self._extra_faces += int(self._faces[ready & ~self._geoms].sum())
+        if leaving.any() or self._extra_faces > self._faces[ready].sum():
+            self._geoms, self._extra_faces = ready, 0
         return self._geoms
 
 
-class SoftwareDrawing(PlainDrawing):
+class SoftwareRenderer(PlainRenderer):
     """Rendering of models that are ``possible``, with all savings.
 
     Attributes:
@@ -166,15 +166,15 @@ class SoftwareDrawing(PlainDrawing):
         for underlay in self._underlays.values():
             underlay.content = b""
 
-    def _draw(self, data: mujoco.MjData, camera: str) -> None:
-        """Render a picture like ``PlainDrawing``, with savings."""
+    def _render_frame(self, data: mujoco.MjData, camera: str) -> None:
+        """Render a picture like ``PlainRenderer``, with savings."""
         shot = Shot(data, camera, self._culling.picture(data, camera))
         if shot.picture.underlaid:
-            self._draw_over_still(shot)
+            self._render_over_still(shot)
         else:
-            self._draw_geoms(shot, shot.picture.opaque)
+            self._render_geoms(shot, shot.picture.opaque)
 
-    def _draw_over_still(self, shot: Shot) -> None:
+    def _render_over_still(self, shot: Shot) -> None:
         """Render a picture over an underlay of the geoms that stand still."""
         camera, opaque = shot.camera, shot.picture.opaque & ~shot.picture.mirror
         view = self._view(shot)
@@ -190,14 +190,14 @@ class SoftwareDrawing(PlainDrawing):
                 self._underlays[camera] = Underlay(self._context, self._rectangle.height, self._rectangle.width)
             underlay, content = self._underlays[camera], view + still.tobytes() + places[still].tobytes()
             if underlay.content != content:
-                self._draw_geoms(shot, still, last=False)
+                self._render_geoms(shot, still, last=False)
                 underlay.keep(content)
-        self._draw_geoms(shot, opaque & ~still, underlay)
+        self._render_geoms(shot, opaque & ~still, underlay)
         if underlay is not None and underlay.ties():
             # At equal depth, the geom that MuJoCo renders last shows. An underlay does not know this order.
-            self._draw_geoms(shot, opaque)
+            self._render_geoms(shot, opaque)
 
-    def _draw_geoms(
+    def _render_geoms(
         self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True
     ) -> None:
         """Render opaque geoms of a picture over an underlay.

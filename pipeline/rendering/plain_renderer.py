@@ -1,6 +1,6 @@
 """Rendering of a scene by MuJoCo's public functions alone.
 
-Subclasses of ``PlainDrawing`` (``savings.py``) must render equal pixels.
+Subclasses of ``PlainRenderer`` (``savings.py``) must render equal pixels.
 """
 
 from collections.abc import Callable, Collection
@@ -41,10 +41,10 @@ def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> 
     return [data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
 
 
-class PlainDrawing:
+class PlainRenderer:
     """Rendering of a whole model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in its own context.
 
-    Close it before you create the next ``PlainDrawing``.
+    Close it before you create the next ``PlainRenderer``.
 
     Args:
         model: the model, which must not be replaced.
@@ -64,7 +64,7 @@ class PlainDrawing:
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
-        """Return whether this class can render a model; ``PlainDrawing`` can render every model."""
+        """Return whether this class can render a model; ``PlainRenderer`` can render every model."""
         return True
 
     def __init__(self, model: mujoco.MjModel, size_px: int = SIZE_PX):
@@ -92,7 +92,7 @@ class PlainDrawing:
     def adopt(self, model: mujoco.MjModel) -> bool:
         """Switch to another model in the same OpenGL context if possible, and return whether it was; here it never is.
 
-        If the result is False, nothing has changed. After an error, close this ``PlainDrawing``.
+        If the result is False, nothing has changed. After an error, close this ``PlainRenderer``.
         """
         return False
 
@@ -108,7 +108,7 @@ class PlainDrawing:
         Call ``mj_forward`` on the data before.
         """
         self._gl.make_current()
-        self._draw(data, camera)
+        self._render_frame(data, camera)
         return self._pixels()
 
     def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
@@ -161,7 +161,7 @@ class PlainDrawing:
         self._gl.free()
         self._context.free()
 
-    def _draw(self, data: mujoco.MjData, camera: str) -> None:
+    def _render_frame(self, data: mujoco.MjData, camera: str) -> None:
         """Render a frame into the off-screen buffer of the current context."""
         self._update(data, camera)
         self._render()
