@@ -153,6 +153,10 @@ class BackgroundPerturbation(RenderPerturbation):
         absent = ABSENT_PARTS[bddl.read(task.bddl_file).arena]
         return tuple(covering for covering in self.coverings if covering.part not in absent)
 
+    def visible_part(self, task: Task) -> BackgroundPerturbation:
+        """Return this change with the coverings that the scene of ``task`` shows."""
+        return self.model_copy(update={"coverings": self.list_shown(task)})
+
     def credits(self, task: Task) -> frozenset[Credit]:
         """List the textures that the scene of ``task`` shows, with their licences."""
         return frozenset(Credit(c.texture, "texture", c.licence, c.author) for c in self.list_shown(task))

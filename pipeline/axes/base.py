@@ -132,6 +132,10 @@ class Perturbation(Frozen):
         """Return this change with the names that things have in all tasks with the initial scene of ``task``."""
         return self
 
+    def visible_part(self, task: Task) -> Self:
+        """Return this change without the parts that the scene of ``task`` does not show, for descriptions."""
+        return self
+
     def played(self, task: Task) -> Task:
         """Return the task whose goal and scene an episode of ``task`` has with this change."""
         return task

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer
+from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer, played_task
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
@@ -29,7 +29,7 @@ from pipeline.planning.plan import Sampler
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
 from pipeline.rendering.renderer import LastScene, scene_of_process
-from pipeline.report.sheets import Tile, describe, lettering, sheet, side_by_side
+from pipeline.report.sheets import Tile, describe, describe_all, lettering, sheet, side_by_side
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task, Trajectory
@@ -244,7 +244,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     if strips:
         tiles, sampled, views = strips, [], ["image"]
     for perturbations in sampled:
-        caption = "; ".join(map(describe, perturbations))
+        caption = describe_all(perturbations, played_task(demo.task, perturbations))
         try:
             # A perturbation of the instruction alone changes no frame.
             visible = any(p.views for p in perturbations)
@@ -262,7 +262,7 @@ def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
     push = perturbations[0]
     if len(perturbations) > 1 or push.acts_until is None:
         return []
-    caption = f"without and with {describe(push)}"
+    caption = f"without and with {describe(push, stage.demo.task)}"
     try:
         steps_and_frames = stage.strip(push)
     except RejectedError as rejected:

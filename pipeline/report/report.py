@@ -23,7 +23,7 @@ from pipeline.report import coverage, figures, pages, seen, yields
 from pipeline.report.coverage import AxisPlots
 from pipeline.report.figures import Panel
 from pipeline.report.pages import Clip
-from pipeline.report.sheets import describe_all, name_episode
+from pipeline.report.sheets import describe_episode, name_episode
 from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
 from pipeline.run.counts import Counts, Diversity, Rows, by_axis
@@ -226,7 +226,7 @@ def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
         visible = [row for row in paired if _agent_view(row) != _agent_view(twins[row["twin_id"]])]
         if visible:
             row = min(visible, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
-            caption = f"{name_episode(row)}: {describe_all(from_json(row['perturbations']))}"
+            caption = f"{name_episode(row)}: {describe_episode(row)}"
             videos.append(_video(row, load, caption))
     return videos
 

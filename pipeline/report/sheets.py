@@ -9,12 +9,12 @@ from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
 
-from pipeline.axes import from_json
+from pipeline.axes import from_json, task_of
 from pipeline.axes.base import Layer, Perturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.run.counts import by_axis, twins
-from pipeline.types import Episode, Frame
+from pipeline.types import Episode, Frame, Task
 
 Font = ImageFont.ImageFont | ImageFont.FreeTypeFont
 
@@ -91,7 +91,7 @@ def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
     for episode_id in (row["twin_id"], row["episode_id"]):
         frames = load(episode_id).frames["image"]
         pair.append(decode(frames[_moment(perturbations, len(frames))]))
-    return Tile(side_by_side(pair, PAIR_SIDE_PX), f"{name_episode(row)}: {describe_all(perturbations)}")
+    return Tile(side_by_side(pair, PAIR_SIDE_PX), f"{name_episode(row)}: {describe_episode(row)}")
 
 
 def _moment(perturbations: Sequence[Perturbation], steps: int) -> int:
@@ -118,14 +118,25 @@ def name_episode(row: Mapping[str, Any]) -> str:
     return f"{row['suite']}, {task}, episode {row['episode_id']}"
 
 
-def describe_all(perturbations: Sequence[Perturbation]) -> str:
+def describe_episode(row: Mapping[str, Any]) -> str:
     """Describe the perturbations of an episode in one line."""
-    return "; ".join(map(describe, perturbations))
+    task = task_of(row["suite"], row["task"], row["perturbations"])
+    return describe_all(from_json(row["perturbations"]), task)
 
 
-def describe(perturbation: Perturbation) -> str:
-    """Describe a perturbation in one line: component, level and the parameters that are not at their defaults."""
-    parameters = perturbation.model_dump(exclude={"axis", "component", "level", "seed"}, exclude_defaults=True)
+def describe_all(perturbations: Sequence[Perturbation], task: Task) -> str:
+    """Describe perturbations of one episode of ``task`` in one line."""
+    return "; ".join(describe(perturbation, task) for perturbation in perturbations)
+
+
+def describe(perturbation: Perturbation, task: Task) -> str:
+    """Describe a perturbation in one line: component, level and the parameters that are not at their defaults.
+
+    Parts that the scene of ``task`` does not show are left out.
+    """
+    parameters = perturbation.visible_part(task).model_dump(
+        exclude={"axis", "component", "level", "seed"}, exclude_defaults=True
+    )
     heading = f"{perturbation.component.replace('_', ' ')}, level {perturbation.level}"
     return f"{heading}: {', '.join(_describe_parameters(parameters))}".removesuffix(": ")
 

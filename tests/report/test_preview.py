@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import pytest
+from arenas import TASKS
 from conftest import BOWL, MILK, PLATE, REPOSITORY, starter_demo
 from PIL import Image
 
 from pipeline import __main__ as command_line
 from pipeline.axes import AXES, Axes, Perturbation, PhysicsPerturbation, RenderPerturbation, components_of, to_json
+from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.base import Axis, Nearest
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.disturbance import DisturbanceAxis
@@ -399,6 +401,16 @@ def test_sheets_show_a_start_at_once_and_a_push_when_it_ends(
 ) -> None:
     rows = [of_run("twin", "twin"), of_run("push", "twin", change)]
     assert shown_next_to_twins(rows, tmp_path / "sheets") == {change.axis: steps}
+
+
+def test_a_caption_names_the_coverings_that_the_scene_shows() -> None:
+    """As many as the textures of LIBERO's arenas: only kitchens have cupboards, and some tasks work on the floor."""
+    axis = BackgroundAxis(components=("theme",), sources=("procedural",))
+    theme = axis.sample(rng("caption"), MILK, 0)
+    named = {arena: sheets.describe(theme, task) for arena, task in TASKS.items()}
+    counts = {arena: caption.count("texture") for arena, caption in named.items()}
+    assert counts == {"tabletop": 3, "floor": 2, "kitchen": 4, "living_room": 3, "study": 3}
+    assert [arena for arena, caption in named.items() if "cupboard" in caption] == ["kitchen"]
 
 
 def test_a_value_is_not_parted_from_its_name() -> None:
