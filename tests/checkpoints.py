@@ -17,7 +17,7 @@ IMAGE = "observation.images.image"
 BIAS = "model.action_head.bias"
 
 
-def save(folder: Path, action: float, scale: float = 1.0, image: str = IMAGE) -> Path:
+def save(folder: Path, action: float, scale: float = 1.0, image: str = IMAGE, least: float = -1.0) -> Path:
     """Save an ACT policy whose every action is ``action`` times ``scale`` in all seven numbers, taken two at a time.
 
     Args:
@@ -25,6 +25,7 @@ def save(folder: Path, action: float, scale: float = 1.0, image: str = IMAGE) ->
         action: output of the network: all of its weights are zero except the last bias.
         scale: factor of the processor after the network.
         image: key of the policy's image. Another key than ``IMAGE`` was renamed by ``--rename_map`` in its training.
+        least: smallest action of the dataset, by its statistics.
     """
     config = ACTConfig(
         input_features={
@@ -45,6 +46,7 @@ def save(folder: Path, action: float, scale: float = 1.0, image: str = IMAGE) ->
     sizes = {image: (3, 1, 1), "observation.state": (8,), "action": (7,)}
     stats = {name: {"mean": torch.zeros(size), "std": torch.ones(size)} for name, size in sizes.items()}
     stats["action"]["std"] *= scale
+    stats["action"] |= {"min": torch.full((7,), least), "max": torch.ones(7)}
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     if image != IMAGE:
         # As lerobot-train sets it; make_pre_post_processors takes it for saved processors only.

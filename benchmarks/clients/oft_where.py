@@ -23,7 +23,10 @@ def list_expected(manifest: Path, suite: str, conditions: dict[str, tuple[str, .
     """Return the sorted numbers of steps of the suite's kept episodes whose labels meet the conditions."""
     steps = []
     for row in pq.read_table(manifest).to_pylist():
-        is_chosen = all(str(row[label]) in values for label, values in conditions.items())
+        is_chosen = True
+        for label, values in conditions.items():
+            parts = [row[label]] if label == "axis" else row[label].split("+")
+            is_chosen = is_chosen and {*parts} <= {*values}
         if row["kept"] and row["suite"] == suite and is_chosen:
             steps.append(row["steps"])
     return sorted(steps)
@@ -39,7 +42,7 @@ def main() -> None:
     yaml: Any = importlib.import_module("yaml")
     recipe = yaml.safe_load((options.data / "finetune" / "finetune.yaml").read_text())["dataset"]
     suites = recipe["suites"]["value"]
-    conditions = dict(map(script.condition, options.conditions))
+    conditions = script.join_conditions(map(script.condition, options.conditions), recipe["labels"]["value"])
     # OFT selects its constants by the word "libero" in the arguments.
     sys.argv = [sys.argv[0], "libero"]
     script.register(recipe["mixtures"]["value"], {})

@@ -51,7 +51,7 @@ class LanguagePerturbation(TextPerturbation):
 
     clearance: ClassVar[float] = 0.2
     unit: ClassVar[str | None] = "share of characters to edit"
-    measure: ClassVar[str] = "to the task's test instructions without case and punctuation"
+    measure: ClassVar[str] = "to the task's test instructions without case and punctuation; 0 for copies"
 
     def apply(self, instruction: str) -> str:
         """Return the wording that replaces ``instruction``."""

@@ -37,9 +37,6 @@ _PREAMBLE = re.compile(
     r"|\b(variation|variant|rewrite|rephrasing|paraphrase)s? (of|for)\b",
     re.IGNORECASE,
 )
-_PREMISE = re.compile(r"with (the|its) [a-z' -]*?\b(on(?! (the|its|a|top)\b)|open|opened|stored)\b")
-"""Beginning of a sentence that takes a requested step for done: ``with the top drawer opened, put the bowl in``."""
-
 _MARK = re.compile(r"[^a-z ]")
 _WELL_FORMED = re.compile(r"[a-z]+(?:[,.?!;:]? [a-z]+|['-][a-z]+)*")
 
@@ -83,8 +80,6 @@ def lint(text: str, task: Task, component: Component) -> str | None:
         return f"{words_and_marks} words and marks, wanted {LENGTH}"
     if len(text) > MAX_CHARACTERS:
         return f"{len(text)} characters, wanted {LENGTH}"
-    if _PREMISE.match(text):
-        return "presents a requested step as done"
     if normalise(text) == normalise(task.instruction):
         return "equal to the original"
     hints = component not in NAMED

@@ -81,6 +81,7 @@ def build(
         "episodes": sourced(len(kept), MANIFEST),
         "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
         "episodes_by_suite_and_axis": sourced({suite: dict(axes) for suite, axes in counts.items()}, MANIFEST),
+        "labels": sourced(_list_labels(kept), MANIFEST + ": the values that --where of run_openvla_oft.py accepts"),
     }
     oft_validates = False
     if rlds is not None:
@@ -101,6 +102,16 @@ def build(
         tested = [*(f"--suite {suite}" for suite in sorted(counts)), "--own-step-limit N"]
     sections = _training_and_clients(export, oft_validates, rewrite_probability, content, tested)
     return {"name": (rlds or export).name, "dataset": dataset, **sections}
+
+
+def _list_labels(kept: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """List the axes, the single components and the single levels of the kept episodes."""
+    axes, components, levels = set(), set(), set()
+    for row in kept:
+        axes.add(row["axis"])
+        components.update(row["component"].split("+"))
+        levels.update(str(row["level"]).split("+"))
+    return {"axis": sorted(axes), "component": sorted(components), "level": sorted(levels)}
 
 
 def _training_and_clients(

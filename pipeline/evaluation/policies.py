@@ -324,6 +324,29 @@ def cameras_of(config: Any, renamed: Mapping[str, str], folder: Path) -> dict[st
     return cameras
 
 
+def warn_of_inverted_gripper(processor: Any, folder: Path) -> None:
+    """Log a warning if a policy was trained on gripper commands from 0 to 1, and returns them.
+
+    LIBERO's commands are -1 (open) and 1 (closed). In IPEC's convention 0 is closed and 1 is open, so that the hand
+    would close in place of opening.
+
+    Args:
+        processor: lerobot's postprocessor of the policy.
+        folder: folder of the policy, for the message.
+    """
+    from lerobot.processor.normalize_processor import UnnormalizerProcessorStep
+
+    for step in processor.steps:
+        if isinstance(step, UnnormalizerProcessorStep):
+            least = (step.stats or {}).get("action", {}).get("min")
+            if least is not None and np.ravel(least)[-1] >= 0:
+                logging.getLogger(__name__).warning(
+                    "%s was trained on gripper commands from 0 to 1. LIBERO's are -1 (open) and 1 (closed): unless the "
+                    "policy converts them, train on export.lerobot.convention: libero",
+                    folder,
+                )
+
+
 def _renamed(processor: Any) -> dict[str, str]:
     """Return the keys of observations that a policy's processor renames, and their new names."""
     from lerobot.processor.rename_processor import RenameObservationsProcessorStep
@@ -369,6 +392,7 @@ class Checkpoint:
         self._before, self._after = make_pre_post_processors(
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
         )
+        warn_of_inverted_gripper(self._after, folder)
         self._cameras = cameras_of(config, _renamed(self._before), folder)
         chunked = getattr(config, "n_obs_steps", 1) == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
         self._chunk = int(getattr(config, "n_action_steps", 1)) if chunked else 1

@@ -5,6 +5,7 @@ holds.
 """
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -142,10 +143,20 @@ def called(bddl: Bddl, name: str) -> str:
     scene = _Scene(bddl)
     kind, part = scene.part(name)
     if part not in SIDES and name in bddl.targets and scene.has_namesakes(name):
-        sides = [side for side in SIDES if side in bddl.language.split()]
-        if len(sides) == 1:
-            part = sides[0]
+        part = _find_side(bddl.language, _noun(kind)) or part
     return _words(kind, part)
+
+
+def _find_side(instruction: str, noun: str) -> str | None:
+    """Return the side that an instruction gives a thing: the left book, or the book on the left.
+
+    The sides of other things do not count, such as that of a compartment in which the book is placed.
+    """
+    side, word = f"({'|'.join(SIDES)})", noun.split()[-1]
+    before = rf"\b{side} (?:\w+ )?{word}\b"
+    behind = rf"\b{word} (?:on|in|at) the {side}(?= and\b|,|$)"
+    match = re.search(before, instruction) or re.search(behind, instruction)
+    return match and match[1]
 
 
 def called_at_start(bddl: Bddl, name: str) -> str:

@@ -1,9 +1,9 @@
 """Subtasks of a trajectory in plain words, from contacts, joints and the gripper's commands.
 
 A lifted object of the goal has four subtasks: approach it, grasp it, move it to its place, place it there. An object
-that is moved without being lifted is pushed, unless it rises on another object in the hand. A drawer, door or knob of
-the goal has two: approach it, then open, close or turn it. A subtask lasts until the next begins, so exactly one
-subtask is active at each step.
+that is moved without being lifted is pushed. If it rises without a grip, it is carried together with another object:
+approach it, move it, place it. A drawer, door or knob of the goal has two: approach it, then open, close or turn it. A
+subtask lasts until the next begins, so exactly one subtask is active at each step.
 
 Until an object is lifted, the words for it include its place at the start if other things have the same noun: the black
 bowl next to the ramekin.
@@ -38,7 +38,7 @@ MOVED_M, LIFTED_M = 0.02, 0.01
 """
 
 CARRIED_M = 0.05
-"""Least rise of an object without a grip that lies on another object in the hand; a pushed object rises less."""
+"""Least rise of an object without a grip that is carried together with another object; a pushed object rises less."""
 
 TURNED, MOVING = 0.1, 0.005
 """Least shares of its range by which a drawer, door or knob moves in all, and in a step in which it counts as moving.
@@ -148,9 +148,14 @@ class _Seen:
             if _distances(place[reached : left + 1], place[reached]).max() < MOVED_M:
                 continue
             if not len(lifted):
-                # A thing that rises without a grip lies on another thing in the hand.
-                if np.max(place[reached : left + 1, 2]) - place[reached, 2] < CARRIED_M:
+                heights_m = place[reached : left + 1, 2]
+                if heights_m.max() - heights_m[0] < CARRIED_M:
                     yield _Deed(reached, left, thing_at_start, (Subtask(reached, f"push {thing_at_start} {to}"),))
+                else:
+                    rising = reached + int(np.argmax(heights_m >= heights_m[0] + LIFTED_M))
+                    lowered = reached + int(np.flatnonzero(heights_m >= heights_m[-1] + LIFTED_M)[-1]) + 1
+                    carried = Subtask(rising, f"move {thing} {to}"), Subtask(lowered, f"place {thing} {at}")
+                    yield _Deed(reached, left, thing_at_start, carried)
                 continue
             grasp = np.flatnonzero(~self.closing[: lifted[0]]).max(initial=-1) + 1
             release = int(grips[-1]) + 1

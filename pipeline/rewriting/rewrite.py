@@ -17,12 +17,14 @@ from jinja2 import StrictUndefined, Template
 from pydantic import TypeAdapter
 
 from pipeline.axes.language import Bank, load_bank, read_bank
+from pipeline.axes.language_copies import copies_test
 from pipeline.axes.language_lint import CLASSES, LENGTH, REMEDY, Component, lint, normalise
 from pipeline.errors import PipelineError
 from pipeline.files import write
 from pipeline.libero.bddl import Fact, read
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.rewriting.language_model import UnusableError
+from pipeline.testset import benchmark
 from pipeline.types import Task
 
 IDLE_ANSWERS = 3
@@ -167,6 +169,8 @@ def _sift(
         fault = lint(text, task, component)
         if not fault and normalise(text) in taken:
             fault = "a repetition"
+        if not fault and copies_test(text, benchmark.load(), task):
+            fault = "a copy of a test instruction of LIBERO-Plus"
         if fault:
             reasons[fault] += 1
         else:

@@ -96,7 +96,6 @@ def test_no_rewrite_is_stored_twice_in_a_suite(suite: str) -> None:
         ("go, " * 19 + "on", "39 words and marks"),
         ("go understandingly " * 9 + "on", "173 characters"),
         ("put the bowl, on the plate", "original"),
-        ("with the plate opened, put the bowl on it", "presents a requested step as done"),
     ],
 )
 def test_lint_names_the_fault(text: str, reason: str) -> None:
@@ -123,6 +122,14 @@ def test_normalise_forgets_case_punctuation_and_spacing() -> None:
 
 def test_equal_keys_sample_equal_perturbations(task: Task) -> None:
     assert sample(task, 7) == sample(task, 7)
+
+
+def test_no_rewrite_takes_a_requested_step_for_done() -> None:
+    """Such as: with the top drawer opened, put the bowl in."""
+    premise = re.compile(r"with (the|its) [a-z' -]*?\b(on(?! (the|its|a|top)\b)|open|opened|stored)\b")
+    texts = [text for known in TASKS for group in load_bank()[known.suite][known.name].values() for text in group]
+    assert len(texts) > 2000
+    assert [text for text in texts if premise.match(text)] == []
 
 
 def test_variants_are_distinct_until_the_bank_is_exhausted(task: Task) -> None:

@@ -90,8 +90,9 @@ def trained(folder: Path, *words: str) -> tuple[dict[str, Any], dict[str, Any]]:
         place.write_text(json.dumps(actions.tolist()))
     (folder / "mix").mkdir()
     subprocess.run("ln -s $PWD/data/rlds/* $PWD/libero/*_no_noops mix", shell=True, cwd=folder, check=True)
+    labels = {"axis": "camera", "component": "distance", "level": "2"}
     rows = [
-        {"suite": f"libero_{suite}", "axis": "camera", "kept": True, "steps": 9, "rlds_shard": f"libero_mine_{suite}-0"}
+        {"suite": f"libero_{suite}", **labels, "kept": True, "steps": 9, "rlds_shard": f"libero_mine_{suite}-0"}
         for suite in ("goal", "spatial")
     ]
     (folder / "data" / "manifest.parquet").write_bytes(b"rows")

@@ -22,7 +22,7 @@ from conftest import datasets_in
 from tiny_recipe import NAME, SUITES, export_config, tiny_recipe
 
 from pipeline.clients.recipe import write
-from pipeline.clients.templates.run_openvla_oft import condition
+from pipeline.clients.templates.run_openvla_oft import condition, join_conditions
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,14 @@ def stand_in(folder: Path, files: dict[str, str]) -> Path:
         (folder / name).write_text(text)
     return folder
 
+
+EPISODES = {
+    "episode_id": ["clean", "weak", "strong", "joint", "stronger", "noise"],
+    "axis": ["clean", "camera", "camera", "camera+noise", "camera+noise", "noise"],
+    "component": ["none", "distance", "distance", "distance+gauss", "spherical+gauss", "gauss"],
+    "level": ["0", "1", "3", "2+1", "2+4", "1"],
+}
+"""Labels of six episodes."""
 
 OFT_DATA = "prismatic/vla/datasets/rlds"
 OFT = {
@@ -226,12 +234,53 @@ def test_openvla_oft_continues_under_the_statistics_of_a_checkpoint(trained: Pat
     assert "it has: bridge" in done.stderr
 
 
-def test_a_condition_is_a_label_and_its_values() -> None:
-    assert condition("axis=clean,camera+noise") == ("axis", ("clean", "camera+noise"))
+def test_conditions_are_labels_and_their_values() -> None:
+    assert condition("axis=clean, camera+noise") == ("axis", ("clean", "camera+noise"))
     assert condition("level=0") == ("level", ("0",))
-    for text in ("axis", "axis=", "=camera", "axis=clean,", ""):
-        with pytest.raises(argparse.ArgumentTypeError, match="expected a label and its values: axis=clean,camera"):
+    for text in ("axis", "axis=", "=camera", "axis=clean,", "", "path_m=1.5", "axes=camera"):
+        with pytest.raises(argparse.ArgumentTypeError, match="expected values of axis, component, level"):
             condition(text)
+    offered = {"axis": ["camera", "camera+noise", "clean"], "component": ["none", "gauss"], "level": ["0", "3"]}
+    given = [condition("axis=clean,noise+camera"), condition("level=0"), condition("axis=camera")]
+    assert join_conditions(given, offered) == {"axis": ("clean", "camera+noise", "camera"), "level": ("0",)}
+    with pytest.raises(SystemExit, match=r"no episode has the axis camra\n  they have: camera, camera\+noise, clean"):
+        join_conditions([condition("axis=clean,camra")], offered)
+
+
+@pytest.mark.slow
+def test_tensorflow_chooses_episodes_by_all_parts_of_their_labels(data: Path, tmp_path: Path) -> None:
+    """The script's own filter on episodes as OFT's reader returns them: each label is repeated for every step."""
+    script = f"""
+import sys, types
+import tensorflow as tf
+
+class DLataset:
+    @staticmethod
+    def from_rlds(builder, split):
+        def repeat(labels):
+            repeated = {{name: tf.repeat(label[None], 3) for name, label in labels.items()}}
+            return {{"traj_metadata": {{"episode_metadata": repeated}}}}
+        return tf.data.Dataset.from_tensor_slices({EPISODES}).map(repeat)
+
+sys.modules["dlimp"] = types.SimpleNamespace(DLataset=DLataset)
+sys.path.insert(0, {str(data / "finetune")!r})
+import run_openvla_oft
+run_openvla_oft.choose_episodes(["ours"], {{"axis": ("clean", "camera", "camera+noise"), "level": ("0", "1", "2")}})
+for name in ("ours", "libero_goal_no_noops"):
+    read = DLataset.from_rlds(types.SimpleNamespace(name=name), split="train")
+    print(*(each["traj_metadata"]["episode_metadata"]["episode_id"][0].numpy().decode() for each in read))
+run_openvla_oft.choose_episodes(["ours"], {{"level": ("5",)}})
+DLataset.from_rlds(types.SimpleNamespace(name="ours"), split="val")
+"""
+    requirements = ["--with", "tensorflow-cpu==2.21.0", "--with", "tensorflow-datasets==4.9.10"]
+    command = ["uv", "run", "--no-project", "--isolated", "--python", "3.11", *requirements, "python", "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines()[-2:] == ["clean weak joint", "clean weak strong joint stronger noise"]
+    assert done.returncode == 1
+    assert done.stderr.endswith(
+        "error: no episode of ours, split val, has level=5\n"
+        "  try: other values of --where, or --dataset_name for the dataset of one suite\n"
+    )
 
 
 @pytest.mark.parametrize("isolated", [False, True], ids=["other environment", "no packages at all"])

@@ -14,7 +14,8 @@ SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}
 
 def row(suite: str, axis: str, kept: bool = True) -> dict[str, Any]:
     shard = f"{SUITES[suite]}-train.tfrecord-00000-of-00002" if kept else None
-    return {"suite": suite, "axis": axis, "kept": kept, "steps": 100 if kept else None, "rlds_shard": shard}
+    labels = {"axis": axis, "component": f"some_{axis}", "level": "3"}
+    return {"suite": suite, **labels, "kept": kept, "steps": 100 if kept else None, "rlds_shard": shard}
 
 
 ROWS = [

@@ -142,6 +142,15 @@ def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_rejected(
         Checkpoint(folder)
 
 
+@pytest.mark.parametrize(("least", "warnings"), [(-1.0, 0), (0.0, 1)])
+def test_a_checkpoint_whose_gripper_would_be_inverted_is_named(
+    least: float, warnings: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Commands from 0 (closed) to 1 (open) are IPEC's, and ACT returns them as they are."""
+    Checkpoint(checkpoints.save(tmp_path, 0.25, least=least))
+    assert [record.getMessage().count("gripper commands from 0 to 1") for record in caplog.records] == [1] * warnings
+
+
 def test_a_checkpoint_of_renamed_images_acts_like_one_of_ours(tmp_path: Path) -> None:
     """It gets the agent view under its own name."""
     agent_view = np.resize(np.arange(251, dtype=np.uint8), (32, 32, 3))

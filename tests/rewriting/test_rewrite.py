@@ -24,7 +24,7 @@ SENTENCES = tuple(
     f"{please} {verb} the stove {ending}"
     for please in ("please", "kindly", "now", "at last", "do")
     for verb in ("switch on", "heat up", "start", "fire up")
-    for ending in ("for me", "over there", "at once", "for the soup")
+    for ending in ("up here", "over there", "at once", "for the soup")
 )
 
 Reply = Callable[[BaseHTTPRequestHandler], None]

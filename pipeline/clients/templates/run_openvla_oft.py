@@ -28,8 +28,9 @@ Each training sample gets one of its episode's rewrites in place of the instruct
 ``rewrite_probability`` of the settings. It is 0 if the run's configuration does not set it; ``--rewrite_probability P``
 overrides it. Validation and LIBERO's own datasets keep their instructions.
 
-To train on a part of the episodes, choose them by labels, the fields of ``episode_metadata`` in the RLDS files. An
-episode has to have one of the listed values of each named label. Clean episodes have the axis ``clean`` and level 0:
+To train on a part of the episodes, choose them by the labels ``axis``, ``component`` and ``level``. An episode has to
+have a listed value of each named label. Clean episodes have the axis ``clean`` and level 0. An episode of several axes
+needs all its components and levels in the lists:
 
     --where axis=clean,camera,camera+noise --where level=0,1,2
 
@@ -73,6 +74,8 @@ HERE = Path(__file__).resolve().parent
 OFT = "openvla_oft"
 SCRIPT = "vla-scripts/finetune.py"
 DATASETS = "prismatic.vla.datasets.rlds"
+LABELS = ("axis", "component", "level")
+"""Labels of ``--where``."""
 
 
 def mixed(text: str) -> tuple[str, float]:
@@ -86,10 +89,38 @@ def mixed(text: str) -> tuple[str, float]:
 def condition(text: str) -> tuple[str, tuple[str, ...]]:
     """Parse a label and its values from a text such as ``axis=clean,camera``."""
     label, _, values = text.partition("=")
-    listed = tuple(values.split(","))
-    if not label or not all(listed):
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a label and its values: axis=clean,camera")
+    listed = tuple(value.strip() for value in values.split(","))
+    if label not in LABELS or not all(listed):
+        raise argparse.ArgumentTypeError(
+            f"{text!r}, expected values of {', '.join(LABELS)}, such as axis=clean,camera,camera+noise"
+        )
     return label, listed
+
+
+def join_conditions(
+    given: Sequence[tuple[str, tuple[str, ...]]], offered: Mapping[str, Collection[str]]
+) -> dict[str, tuple[str, ...]]:
+    """Join the conditions on each label, and sort the axes in the names of combinations as the datasets do.
+
+    Args:
+        given: results of ``condition``.
+        offered: label to the values that episodes of this run have.
+
+    Raises:
+        SystemExit: if no episode has one of the values.
+    """
+    by_parts = {tuple(sorted(name.split("+"))): name for name in offered["axis"]}
+    conditions: dict[str, tuple[str, ...]] = {}
+    for label, values in given:
+        named = [by_parts.get(tuple(sorted(value.split("+"))), value) if label == "axis" else value for value in values]
+        unknown = [value for value in named if value not in offered[label]]
+        if unknown:
+            sys.exit(
+                f"error: no episode has the {label} {', '.join(unknown)}\n"
+                f"  they have: {', '.join(sorted(offered[label]))}"
+            )
+        conditions[label] = (*conditions.get(label, ()), *named)
+    return conditions
 
 
 def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, float]) -> None:
@@ -124,7 +155,7 @@ def choose_episodes(datasets: Collection[str], conditions: Mapping[str, Collecti
 
     Args:
         datasets: datasets of this run; others are read completely.
-        conditions: name of a label to its accepted values.
+        conditions: result of ``join_conditions``.
     """
     tf: Any = importlib.import_module("tensorflow")
     # OFT reads every split through this class.
@@ -136,19 +167,15 @@ def choose_episodes(datasets: Collection[str], conditions: Mapping[str, Collecti
         met = []
         for label, values in conditions.items():
             # OFT's reader repeats each label for every step.
-            value = labels[label][0]
-            text = value if value.dtype == tf.string else tf.strings.as_string(value)
-            met.append(tf.reduce_any(text == tf.constant(list(values))))
+            text = labels[label][0]
+            parts = text[None] if label == "axis" else tf.strings.split(text, "+")
+            met.append(tf.reduce_all(tf.reduce_any(parts[:, None] == tf.constant(list(values)), axis=1)))
         return tf.reduce_all(met)
 
     def read_chosen(builder: Any, split: str, **options: Any) -> Any:
         episodes = read(builder, split=split, **options)
         if builder.name not in datasets:
             return episodes
-        labels = episodes.element_spec["traj_metadata"]["episode_metadata"]
-        unknown = conditions.keys() - labels.keys()
-        if unknown:
-            sys.exit(f"error: episodes have no label {' or '.join(sorted(unknown))}\n  they have: {', '.join(labels)}")
         chosen = episodes.filter(is_chosen)
         # From no episodes, OFT would wait for its first sample without end.
         if next(iter(chosen.take(1)), None) is None:
@@ -413,6 +440,8 @@ def prepare() -> None:
     rewrite_probability = training.get("rewrite_probability", {"value": 0.0})["value"]
     parser.add_argument("--rewrite_probability", type=probability_of, default=rewrite_probability)
     options, given = parser.parse_known_args()
+    if options.statistics and options.client != OFT:
+        sys.exit(f"error: --statistics is for {OFT}: {options.client} does not resume from a whole checkpoint")
     added, suites = dict(options.mix), dataset["suites"]["value"]
     suite_of = {name: suite for suite, name in suites.items()}
     suite_of |= {name: name.removesuffix("_no_noops") for name in added}
@@ -430,9 +459,7 @@ def prepare() -> None:
     former = statistics_of(options.statistics, dict.fromkeys(suite_of.values())) if options.statistics else {}
     content = dataset["sha256"]["value"]
     if options.where:
-        conditions: dict[str, tuple[str, ...]] = {}
-        for label, values in options.where:
-            conditions[label] = (*conditions.get(label, ()), *values)
+        conditions = join_conditions(options.where, dataset["labels"]["value"])
         choose_episodes({*suites.values()}, conditions)
         content += json.dumps(conditions)
     set_statistics(content, suite_of, former)

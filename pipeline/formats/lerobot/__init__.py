@@ -131,8 +131,8 @@ class LeRobot(Format[LeRobotConfig]):
     recipe: ClassVar = 14
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     held_out_place: ClassVar = (
-        "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless it is restricted "
-        "as below."
+        "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless "
+        "`--dataset.episodes` leaves them out."
     )
     maps_stored_as: ClassVar = MAPS_STORED_AS
     flattens_matrices: ClassVar = True
