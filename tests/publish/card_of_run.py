@@ -45,6 +45,8 @@ def row(axis: str, *changes: Perturbation, task: Task = MILK, reason: str = "kep
         "demo_id": f"{task.suite}/{task.name}/demo_0",
         "demo_origin": "human",
         "axis": axis,
+        "component": "+".join(change.component for change in changes) or "clean",
+        "level": "+".join(str(change.level) for change in changes) or "0",
         "perturbations": to_json(list(changes)),
         "kept": kept,
         "reason": reason,

@@ -46,8 +46,12 @@ def says(content: object) -> Reply:
     return status(200, json.dumps({"choices": [{"message": {"role": "assistant", "content": content}}]}).encode())
 
 
+SHORT_S = 1.5
+"""Time limit for an answer in the test of servers that give none."""
+
+
 def hangs(handler: BaseHTTPRequestHandler) -> None:
-    time.sleep(0.6)
+    time.sleep(2 * SHORT_S)
 
 
 def trickles(handler: BaseHTTPRequestHandler) -> None:
@@ -55,9 +59,9 @@ def trickles(handler: BaseHTTPRequestHandler) -> None:
     handler.send_response(200)
     handler.send_header("Content-Length", "1000")
     handler.end_headers()
-    for _ in range(10):
+    for _ in range(20):
         handler.wfile.write(b" ")
-        time.sleep(0.1)
+        time.sleep(SHORT_S / 10)
 
 
 def hangs_up(handler: BaseHTTPRequestHandler) -> None:
@@ -104,8 +108,8 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
         yield server
 
 
-def ask(server: Server) -> LanguageModel:
-    return LanguageModel(server.url, "tiny", timeout_s=0.3, backoff_s=0.01)
+def ask(server: Server, timeout_s: float = 30.0) -> LanguageModel:
+    return LanguageModel(server.url, "tiny", timeout_s=timeout_s, backoff_s=0.01)
 
 
 def lists(*each: int) -> list[Reply]:
@@ -221,7 +225,7 @@ def test_busy_and_broken_endpoints_are_asked_again(server: Server, tmp_path: Pat
     ]
     server.replies = [reply for bad, fine in zip(trouble, good, strict=True) for reply in (*bad, fine)]
     bank = tmp_path / "bank.yaml"
-    rewrite.extend(STOVE.bddl_file, bank, 1, ask(server))
+    rewrite.extend(STOVE.bddl_file, bank, 1, ask(server, SHORT_S))
     assert counts(bank) == [1, 1, 1, 1]
     assert len(server.asked) == 11
 
