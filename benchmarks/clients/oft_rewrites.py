@@ -9,13 +9,13 @@ the folder of a run:
 import argparse
 import importlib
 import json
-import sys
 from collections import Counter
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
+from oft_recipe import register_run, set_statistics
 
 SIZE_PX = 64
 """Size to which the loader resizes the frames, which are not used here."""
@@ -60,16 +60,9 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=5000)
     parser.add_argument("--probability", type=float, default=0.8)
     options = parser.parse_args()
-    sys.path[:0] = [str(options.data / "finetune"), str(Path.cwd())]
-    script: Any = importlib.import_module("run_openvla_oft")
-    yaml: Any = importlib.import_module("yaml")
-    recipe = yaml.safe_load((options.data / "finetune" / "finetune.yaml").read_text())["dataset"]
-    suites = recipe["suites"]["value"]
-    # OFT selects its constants by the word "libero" in the arguments.
-    sys.argv = [sys.argv[0], "libero"]
-    script.register(recipe["mixtures"]["value"], {})
-    script.set_statistics(recipe["sha256"]["value"], {name: suite for suite, name in suites.items()}, {})
-    script.sample_rewrites({*suites.values()}, options.probability, "benchmark")
+    script, recipe = register_run(options.data)
+    set_statistics(script, recipe)
+    script.sample_rewrites({*recipe["suites"]["value"].values()}, options.probability, "benchmark")
     datasets: Any = importlib.import_module("prismatic.vla.datasets")
     data = datasets.RLDSDataset(
         options.data / "rlds",

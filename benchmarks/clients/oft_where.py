@@ -12,11 +12,11 @@ compared with the rows of the manifest that meet the conditions.
 import argparse
 import importlib
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
+from oft_recipe import register_run, set_statistics
 
 
 def list_expected(manifest: Path, suite: str, conditions: dict[str, tuple[str, ...]]) -> list[int]:
@@ -37,18 +37,11 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("conditions", nargs="+", help="a label and its values: axis=clean,camera")
     options = parser.parse_args()
-    sys.path[:0] = [str(options.data / "finetune"), str(Path.cwd())]
-    script: Any = importlib.import_module("run_openvla_oft")
-    yaml: Any = importlib.import_module("yaml")
-    recipe = yaml.safe_load((options.data / "finetune" / "finetune.yaml").read_text())["dataset"]
+    script, recipe = register_run(options.data)
     suites = recipe["suites"]["value"]
     conditions = script.join_conditions(map(script.condition, options.conditions), recipe["labels"]["value"])
-    # OFT selects its constants by the word "libero" in the arguments.
-    sys.argv = [sys.argv[0], "libero"]
-    script.register(recipe["mixtures"]["value"], {})
     script.choose_episodes({*suites.values()}, conditions)
-    content = recipe["sha256"]["value"] + json.dumps(conditions)
-    script.set_statistics(content, {name: suite for suite, name in suites.items()}, {})
+    set_statistics(script, recipe, json.dumps(conditions))
 
     loader: Any = importlib.import_module("prismatic.vla.datasets.rlds.dataset")
     materialize: Any = importlib.import_module("prismatic.vla.datasets.rlds.oxe.materialize")

@@ -173,9 +173,8 @@ class LanguageAxis(Axis):
             PipelineError: when one of the rewrites does not pass ``lint``.
         """
         texts = []
-        for rewrite in _find_rewrites(
-            task, self._select_components(other_objects=other_objects), self.levels, self.bank
-        ):
+        components = self._select_components(other_objects=other_objects)
+        for rewrite in _find_rewrites(task, components, self.levels, self.bank):
             if rewrite.nearest(test, task).distance >= rewrite.clearance:
                 texts.append(rewrite.text)
         return tuple(texts)

@@ -110,7 +110,7 @@ def _list_labels(kept: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
     for row in kept:
         axes.add(row["axis"])
         components.update(row["component"].split("+"))
-        levels.update(str(row["level"]).split("+"))
+        levels.update(row["level"].split("+"))
     return {"axis": sorted(axes), "component": sorted(components), "level": sorted(levels)}
 
 

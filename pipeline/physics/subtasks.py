@@ -38,7 +38,7 @@ MOVED_M, LIFTED_M = 0.02, 0.01
 """
 
 CARRIED_M = 0.05
-"""Least rise of an object without a grip that is carried together with another object; a pushed object rises less."""
+"""Least rise of an object without a grip that is carried with another object; LIBERO's pushed plate rises less."""
 
 TURNED, MOVING = 0.1, 0.005
 """Least shares of its range by which a drawer, door or knob moves in all, and in a step in which it counts as moving.
@@ -151,11 +151,14 @@ class _Seen:
                 heights_m = place[reached : left + 1, 2]
                 if heights_m.max() - heights_m[0] < CARRIED_M:
                     yield _Deed(reached, left, thing_at_start, (Subtask(reached, f"push {thing_at_start} {to}"),))
-                else:
-                    rising = reached + int(np.argmax(heights_m >= heights_m[0] + LIFTED_M))
-                    lowered = reached + int(np.flatnonzero(heights_m >= heights_m[-1] + LIFTED_M)[-1]) + 1
-                    carried = Subtask(rising, f"move {thing} {to}"), Subtask(lowered, f"place {thing} {at}")
-                    yield _Deed(reached, left, thing_at_start, carried)
+                    continue
+                rising = reached + int(np.argmax(heights_m >= heights_m[0] + LIFTED_M))
+                carried = [Subtask(rising, f"move {thing} {to}")]
+                higher = np.flatnonzero(heights_m >= heights_m[-1] + LIFTED_M)
+                # The trajectory may end before the object comes down.
+                if len(higher):
+                    carried.append(Subtask(reached + int(higher[-1]) + 1, f"place {thing} {at}"))
+                yield _Deed(reached, left, thing_at_start, tuple(carried))
                 continue
             grasp = np.flatnonzero(~self.closing[: lifted[0]]).max(initial=-1) + 1
             release = int(grips[-1]) + 1

@@ -262,3 +262,13 @@ def test_a_stack_in_the_hand_is_moved_and_placed() -> None:
         "move the left black bowl to the tray",
         "place the left black bowl in the tray",
     ]
+    # In these steps, the stack rises and does not come down.
+    rising = replace(
+        trajectory,
+        states=trajectory.states[:191],
+        actions=trajectory.actions[:190],
+        site_alpha=trajectory.site_alpha[:191],
+    )
+    texts = {text for _, text in subtasks(rising, task)}
+    assert "move the left black bowl to the tray" in texts
+    assert "place the left black bowl in the tray" not in texts
