@@ -21,7 +21,7 @@ from pipeline.config import load
 from pipeline.episode_schema import STANDARD
 from pipeline.errors import PipelineError
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, read
-from pipeline.formats.lerobot.columns import Convention
+from pipeline.formats.lerobot.columns import CONVENTIONS, Layout
 from pipeline.run.export import export
 from pipeline.types import Episode, Geometry
 from pipeline.validation.case import Case
@@ -207,7 +207,7 @@ def test_what_validate_does_not_expect_in_it_is_found(
     entry = [one.with_type(TEXTS) if one.name == "tool_calls" else one for one in field.type.value_type]
     spoiled = pa.array([*said[:first], *part, *said[first + len(made) :]], pa.list_(pa.struct(entry)))
     pq.write_table(table.set_column(place, field, spoiled.cast(field.type)), file)
-    copy = read.read(tmp_path / NAME, made.episode_id, STANDARD, Convention("video"))
+    copy = read.read(tmp_path / NAME, made.episode_id, Layout(STANDARD, CONVENTIONS["libero"], "video"))
     assert copy is not None
     no_replay: Any = None
     found = CHECKS["instruction"](Case({"instruction": made.instruction}, made, no_replay, [copy], None))

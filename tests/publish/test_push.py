@@ -20,9 +20,10 @@ from stand_in_hub import ATTRIBUTES, REPOSITORY, Hub, is_large
 from synthetic import SET, write_lerobot
 from validated_run import NAME, RUN, prepare, write_card, write_run
 
+from pipeline.episode_schema import STANDARD
 from pipeline.errors import PipelineError
 from pipeline.formats.lerobot import check
-from pipeline.formats.lerobot.columns import Convention
+from pipeline.formats.lerobot.columns import CONVENTIONS, Layout
 from pipeline.publish.push import Upload, compare, send
 from pipeline.publish.repository import UPLOAD
 
@@ -102,9 +103,10 @@ def test_the_hub_is_in_reach_after_a_dataset_was_found_damaged(hub: Hub, data: P
     upload = prepare(data, "rlds")
     root = data / "lerobot" / NAME
     shutil.rmtree(root / "meta" / "episodes")
+    layout = Layout(STANDARD, CONVENTIONS["libero"], "video")
     check.forget_sessions()  # as in a process that has not spoken with the hub
     with pytest.raises(PipelineError, match=re.escape(str(root))):
-        list(check.check(root, tmp_path / "cache", {}, Convention("video")))
+        list(check.check(root, tmp_path / "cache", {}, layout))
     send(upload, REPOSITORY)
     assert uploaded(hub) == expected(upload)
 

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from importlib.metadata import version
 from math import ceil
 from pathlib import Path
@@ -15,7 +14,7 @@ from pydantic import Field, field_validator
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
 from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, number_pieces, split
-from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, VIEW_AS_VIDEO_KB, Action, Convention, Depth
+from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, VIEW_AS_VIDEO_KB, Action, Depth, Layout
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
 from pipeline.tables import column
@@ -101,12 +100,12 @@ def _require_lerobot_06(content: str) -> None:
         )
 
 
-def _keys(convention: Convention, content: Content, labels: str) -> dict[str, str]:
+def _keys(layout: Layout, labels: str) -> dict[str, str]:
     """Return the ``keys`` of a format, with the place of its ``labels``."""
-    keys = convention.views(content)
-    keys |= {name: convention.name(key) for name, key in convention.motion_keys.items()}
-    for view in content.views:
-        keys |= {f"{view}_{name}": convention.camera_column(view, name) for name in (*MATRICES, *MAPS, "boxes")}
+    keys = layout.views
+    keys |= {name: layout.name(key) for name, key in layout.motion_keys.items()}
+    for view in layout.content.views:
+        keys |= {f"{view}_{name}": layout.camera_column(view, name) for name in (*MATRICES, *MAPS, "boxes")}
     return keys | {"provenance": "meta/provenance.parquet", "labels": labels}
 
 
@@ -144,30 +143,27 @@ class LeRobot(Format[LeRobotConfig]):
 
     def __init__(self, data: Path, options: LeRobotConfig, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
-        self.keys = _keys(self._convention, content, "meta/episodes")
-        if self._convention.open_is_one:
-            self.gripper = OPEN_IS_ONE
-        self.clients = CLIENTS_V30[options.convention]
-        self.step_s += DEPTH_MAP_S * content.area * len(self._convention.depth_videos(content))
-
-    @property
-    def language(self) -> bool:
-        return self.options.language
-
-    @property
-    def _convention(self) -> Convention:
-        options = self.options
-        return replace(
+        self.layout = Layout(
+            content,
             CONVENTIONS[options.convention],
             frames=options.frames,
             language=options.language,
             action=options.action,
             depth=options.depth,
         )
+        self.keys = _keys(self.layout, "meta/episodes")
+        if self.layout.convention.open_is_one:
+            self.gripper = OPEN_IS_ONE
+        self.clients = CLIENTS_V30[options.convention]
+        self.step_s += DEPTH_MAP_S * content.area * len(self.layout.depth_videos)
+
+    @property
+    def language(self) -> bool:
+        return self.options.language
 
     @property
     def depth_as_video(self) -> bool:
-        return bool(self._convention.depth_videos(self.content))
+        return bool(self.layout.depth_videos)
 
     @property
     def root(self) -> Path:
@@ -175,7 +171,7 @@ class LeRobot(Format[LeRobotConfig]):
         return self.folder / self.options.name
 
     def step_kb(self, sizes: StepSizes) -> float:
-        return self._convention.step_kb(sizes, self.content)
+        return self.layout.step_kb(sizes)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         """Divide the episodes into pieces, each one file of each kind.
@@ -200,7 +196,7 @@ class LeRobot(Format[LeRobotConfig]):
         The sizes are those of ``benchmarks/disk.py``, rounded up.
         """
         views = len(self.content.views) * self.content.area
-        text_maps = self._convention.text_maps(self.content)
+        text_maps = self.layout.text_maps
         maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in text_maps)
         images_kb = 40.0 if self.options.frames == "images" else 0.0
         data_kb = 0.5 + views * (maps_kb + images_kb)
@@ -210,12 +206,12 @@ class LeRobot(Format[LeRobotConfig]):
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats.lerobot import write
 
-        write.write_piece(path, piece, load, self._convention, self.content)
+        write.write_piece(path, piece, load, self.layout)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, int]]:
         from pipeline.formats.lerobot import write
 
-        write.finish(work, work / "dataset" / self.options.name, pieces, self._convention, self.content)
+        write.finish(work, work / "dataset" / self.options.name, pieces, self.layout)
         ids = [episode_id for piece in pieces for episode_id in piece.ids]
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
@@ -228,12 +224,12 @@ class LeRobot(Format[LeRobotConfig]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats.lerobot import check
 
-        return check.check(self.root, cache, kept, self._convention, self.content, self.options.validation)
+        return check.check(self.root, cache, kept, self.layout, self.options.validation)
 
     def read(self, row: Row) -> Copy | None:
         from pipeline.formats.lerobot import read
 
-        return read.read(self.root, row["episode_id"], self.content, self._convention)
+        return read.read(self.root, row["episode_id"], self.layout)
 
     def repository_path(self, file: str) -> str:
         # lerobot reads a dataset from the root of the repository.
@@ -327,14 +323,15 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
     def __init__(self, data: Path, options: LeRobotV21Config, content: Content = STANDARD) -> None:
         super().__init__(data, options, content)
-        self.convention = CONVENTIONS[options.convention]
-        self.keys = _keys(self.convention, content, "meta/episodes.jsonl")
-        if self.convention.open_is_one:
+        convention = CONVENTIONS[options.convention]
+        self.layout = Layout(content, convention, frames=convention.frames)
+        self.keys = _keys(self.layout, "meta/episodes.jsonl")
+        if convention.open_is_one:
             self.gripper = OPEN_IS_ONE
         self.clients = CLIENTS_V21[options.convention]
 
     def step_kb(self, sizes: StepSizes) -> float:
-        return self.convention.step_kb(sizes, self.content)
+        return self.layout.step_kb(sizes)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
@@ -353,13 +350,13 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats.lerobot import write
 
-        write.write_piece_v21(path, piece, load, self.convention, self.content)
+        write.write_piece_v21(path, piece, load, self.layout)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
         from pipeline.formats.lerobot import write
 
         for name, members in grouped((Path(piece.path).parent.name, piece) for piece in pieces).items():
-            write.finish_v21(work, work / "dataset" / name, members, self.convention, self.content)
+            write.finish_v21(work, work / "dataset" / name, members, self.layout)
         return {}
 
     def open(self) -> None:
@@ -370,12 +367,12 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats.lerobot import check
 
-        return check.check_v21(self.folder, kept, self.convention, self.content, self.options.validation)
+        return check.check_v21(self.folder, kept, self.layout, self.options.validation)
 
     def read(self, row: Row) -> Copy | None:
         from pipeline.formats.lerobot import read
 
-        return read.read_v21(self.folder, row["episode_id"], self.convention, self.content)
+        return read.read_v21(self.folder, row["episode_id"], self.layout)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         actions = self.keys["action"]

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import SCHEMA, STANDARD, Content
+from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot.columns import (
     DATA_PATH,
@@ -32,7 +32,7 @@ from pipeline.formats.lerobot.columns import (
     STARVLA_STATISTICS,
     VIDEO_PATH,
     VIDEO_PATH_V21,
-    Convention,
+    Layout,
     data_path_v21,
     read_matrix,
     video_path_v21,
@@ -77,8 +77,7 @@ def check(
     root: Path,
     cache: Path,
     kept: Mapping[str, Row],
-    convention: Convention,
-    content: Content = STANDARD,
+    layout: Layout,
     validation: float = 0.0,
 ) -> Iterator[tuple[str, Fault]]:
     """Compare a dataset's metadata with the content of its files.
@@ -100,18 +99,18 @@ def check(
     warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
     with readable(root):
         episodes = rows(root)
-        faults = list(_format(root, episodes, convention, content, validation))
+        faults = list(_format(root, episodes, layout, validation))
     # These faults come first, because lerobot may stop at them with a less specific message.
     yield from (("format", fault) for fault in faults)
     with readable(root, also=(DatasetsError,)):
         # The option exists from lerobot 0.6 on, as such depth does.
-        in_metres: dict[str, Any] = {"depth_output_unit": "m"} if convention.depth_videos(content) else {}
+        in_metres: dict[str, Any] = {"depth_output_unit": "m"} if layout.depth_videos else {}
         with local_only(cache):
             data = LeRobotDataset(root.name, root=root, video_backend="pyav", **in_metres)
         stored = (data.meta.total_episodes, data.num_frames)
-        wrong = list(_wrong_statistics(root, convention, content))
+        wrong = list(_wrong_statistics(root, layout))
         split_of = _split_of(root, episodes)
-        samples = list(_samples(root, data, convention, content))
+        samples = list(_samples(root, data, layout))
     for what, expected in wrong:
         yield "format", Fault("lerobot", None, what, expected)
     for episode_id, key in samples:
@@ -126,16 +125,14 @@ def check(
     yield from in_both_splits("lerobot", split_of, kept)
 
 
-def _format(
-    root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention, content: Content, val: float
-) -> Iterator[Fault]:
+def _format(root: Path, episodes: Mapping[str, Mapping[str, Any]], layout: Layout, val: float) -> Iterator[Fault]:
     """Compare the statements of ``meta/`` with the files and with the episodes."""
     info = json.loads((root / "meta" / "info.json").read_text())
     tasks = pq.read_table(root / "meta" / "tasks.parquet").to_pylist()
     steps = sum(row["length"] for row in episodes.values())
     wanted: dict[str, Any] = {
         "codebase_version": "v3.0",
-        "robot_type": convention.robot_type,
+        "robot_type": layout.convention.robot_type,
         "total_episodes": len(episodes),
         "total_frames": steps,
         "total_tasks": len(tasks),
@@ -144,17 +141,17 @@ def _format(
         "video_files_size_in_mb": FILE_MB,
         "fps": SCHEMA.fps_hz,
         "data_path": DATA_PATH,
-        "video_path": VIDEO_PATH if convention.videos(content) else None,
+        "video_path": VIDEO_PATH if layout.videos else None,
     }
     yield from unlike("lerobot", info, wanted)
     yield from unlike("lerobot", {"fields of info.json": sorted(info)}, {"fields of info.json": _fields(wanted)})
-    yield from unlike("lerobot", info["features"], _as_json(convention.described(content)))
-    unexpected = sorted(info["features"].keys() - convention.columns(content).keys())
+    yield from unlike("lerobot", info["features"], _as_json(layout.described))
+    unexpected = sorted(info["features"].keys() - layout.columns.keys())
     if unexpected:
         yield Fault("lerobot", None, f"info.json describes the columns {unexpected}", "only columns of the data files")
     yield from _wrong_tasks("lerobot", tasks, [row["tasks"][0] for row in episodes.values()])
     yield from _wrong_splits(info["splits"], len(episodes), val)
-    yield from _wrong_files(root, episodes, convention, content)
+    yield from _wrong_files(root, episodes, layout)
     for file in sorted(root.glob("videos/**/*.mp4")):
         yield from _wrong_video("lerobot", file, info["features"][file.parent.parent.name]["info"])
 
@@ -190,12 +187,10 @@ def _split_of(root: Path, episodes: Mapping[str, Mapping[str, Any]]) -> dict[str
     return split_of
 
 
-def _wrong_files(
-    root: Path, episodes: Mapping[str, Mapping[str, Any]], convention: Convention, content: Content
-) -> Iterator[Fault]:
+def _wrong_files(root: Path, episodes: Mapping[str, Mapping[str, Any]], layout: Layout) -> Iterator[Fault]:
     """Compare the existing files with the files that the episodes name."""
     kinds = {"data": ".parquet", "meta/episodes": ".parquet"}
-    kinds |= {f"videos/{column}": ".mp4" for column in convention.videos(content).values()}
+    kinds |= {f"videos/{column}": ".mp4" for column in layout.videos.values()}
     wanted = set()
     for row in episodes.values():
         for kind, suffix in kinds.items():
@@ -209,11 +204,11 @@ def _wrong_files(
     yield from unlike("lerobot", {"files": sorted(existing)}, {"files": sorted(wanted)})
 
 
-def _wrong_statistics(root: Path, convention: Convention, content: Content) -> Iterator[tuple[str, str]]:
+def _wrong_statistics(root: Path, layout: Layout) -> Iterator[tuple[str, str]]:
     """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
-    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(content))
-    for column in convention.pictures(content).values():
+    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), layout.columns)
+    for column in layout.pictures.values():
         names = [f"stats/{column}/{figure}" for figure in (*FIGURES, *QUANTILE_NAMES)]
         tables = [pq.read_table(file, columns=names) for file in episode_files(root)]
         of_episodes = {}
@@ -224,25 +219,25 @@ def _wrong_statistics(root: Path, convention: Convention, content: Content) -> I
         yield from _wrong_frames(column, stored[column], of_episodes)
 
 
-def _samples(root: Path, data: Any, convention: Convention, content: Content) -> Iterator[tuple[str, str]]:
+def _samples(root: Path, data: Any, layout: Layout) -> Iterator[tuple[str, str]]:
     """List each episode and column in which lerobot and ``copy_of`` differ at the sampled steps."""
-    depth_videos = convention.depth_videos(content)
+    depth_videos = layout.depth_videos
     extras: tuple[Extra, ...] = ("depth",) if depth_videos else ()
     episodes = sorted(rows(root).values(), key=lambda row: row["episode_index"])
     places = {round(place) for place in np.linspace(0, len(episodes) - 1, BY_LEROBOT)}
     for place in sorted(places):
         row = episodes[place]
-        copy = copy_of(root, row, replace(content, extras=extras), convention)
+        copy = copy_of(root, row, replace(layout, content=replace(layout.content, extras=extras)))
         for step in sampled(row["length"]):
             item = data[row["dataset_from_index"] + step]
-            for name, v30_key in convention.motion_keys.items():
-                key = convention.name(v30_key)
+            for name, v30_key in layout.motion_keys.items():
+                key = layout.name(v30_key)
                 values = item[key].numpy()[None]
-                if convention.open_is_one and name in ("action", "action_absolute"):
+                if layout.convention.open_is_one and name in ("action", "action_absolute"):
                     values = libero_gripper(values)
                 if not np.array_equal(values[0], getattr(copy.episode, name)[step]):
                     yield row[EPISODE_ID], key
-            for view, column in convention.views(content).items():
+            for view, column in layout.views.items():
                 # lerobot returns floats in [0, 1], channels first.
                 frame = item[column].numpy().transpose(1, 2, 0) * 255
                 if np.abs(frame - copy.frame(view, step)).max() > SAME_LEVELS:
@@ -282,7 +277,7 @@ def forget_sessions() -> None:
 
 
 def check_v21(
-    folder: Path, kept: Mapping[str, Row], convention: Convention, content: Content, validation: float = 0.0
+    folder: Path, kept: Mapping[str, Row], layout: Layout, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
@@ -296,8 +291,8 @@ def check_v21(
     for root in sets_v21(folder):
         with readable(root, VERSION_V21):
             _, rows, _ = opened_v21(root)
-            faults = list(_format_v21(root, convention, content))
-            wrong = list(_wrong_statistics_v21(root, convention, content))
+            faults = list(_format_v21(root, layout))
+            wrong = list(_wrong_statistics_v21(root, layout))
         yield from (("format", fault) for fault in faults)
         for what, expected in wrong:
             yield "format", Fault(dataset, None, f"{root.name}: {what}", expected)
@@ -315,17 +310,17 @@ def check_v21(
     yield from in_both_splits(dataset, split_of, kept)
 
 
-def _format_v21(root: Path, convention: Convention, content: Content) -> Iterator[Fault]:
+def _format_v21(root: Path, layout: Layout) -> Iterator[Fault]:
     """Compare the statements of a set's ``meta/`` with its files and its episodes."""
     info, rows, _ = opened_v21(root)
     tasks = read_lines(root / "meta" / "tasks.jsonl")
-    columns = _as_json(convention.described(content))
+    columns = _as_json(layout.described)
     videos = [key for key, description in columns.items() if description["dtype"] == "video"]
     indices = [row["episode_index"] for row in rows.values()]
     files = [*map(data_path_v21, indices), *(video_path_v21(index, key) for index in indices for key in videos)]
     wanted = {
         "codebase_version": VERSION_V21,
-        "robot_type": convention.robot_type,
+        "robot_type": layout.convention.robot_type,
         "total_episodes": len(rows),
         "total_frames": sum(row["length"] for row in rows.values()),
         "total_tasks": len(tasks),
@@ -353,19 +348,19 @@ def _format_v21(root: Path, convention: Convention, content: Content) -> Iterato
     expected["fields of episodes.jsonl"] = [tuple(sorted(fields))]
     yield from unlike(dataset, read, expected, within)
     yield from _wrong_tasks(dataset, tasks, [row["tasks"][0] for row in rows.values()])
-    if convention.open_is_one:
-        yield from _wrong_modality(dataset, root, columns, convention, content)
-        yield from _wrong_starvla_statistics(dataset, root, convention)
+    if layout.convention.open_is_one:
+        yield from _wrong_modality(dataset, root, columns, layout)
+        yield from _wrong_starvla_statistics(dataset, root, layout)
     # The videos of a set are alike: only the first of each view is opened here. Reading episodes decodes frames of all.
     for key in videos:
         yield from _wrong_video(dataset, root / video_path_v21(indices[0], key), info["features"][key]["info"])
 
 
-def _wrong_statistics_v21(root: Path, convention: Convention, content: Content) -> Iterator[tuple[str, str]]:
+def _wrong_statistics_v21(root: Path, layout: Layout) -> Iterator[tuple[str, str]]:
     """Compare ``meta/stats.json`` with all steps; for frames, compare it with the statistics of the episodes."""
     stored = json.loads((root / "meta" / "stats.json").read_text())
-    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(content))
-    views = convention.views(content).values()
+    yield from _wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), layout.columns)
+    views = layout.views.values()
     figures: dict[tuple[str, str], list[Any]] = {(view, name): [] for view in views for name in FIGURES}
     with (root / "meta" / "episodes_stats.jsonl").open() as lines:
         for line in lines:
@@ -393,7 +388,7 @@ def _wrong_tasks(dataset: str, tasks: Sequence[Mapping[str, Any]], used: Sequenc
 
 
 def _wrong_modality(
-    dataset: str, root: Path, features: Mapping[str, Mapping[str, Any]], convention: Convention, content: Content
+    dataset: str, root: Path, features: Mapping[str, Mapping[str, Any]], layout: Layout
 ) -> Iterator[Fault]:
     """Compare ``meta/modality.json`` with the columns: parts cover a vector in order, and views are the cameras."""
     modality = json.loads((root / "meta" / "modality.json").read_text())
@@ -402,13 +397,13 @@ def _wrong_modality(
         ("state", SCHEMA.state, [*pose, "pad", "gripper"]),
         ("action", SCHEMA.action, [*pose, "gripper"]),
     ):
-        column = convention.name(spec.lerobot_key)
+        column = layout.name(spec.lerobot_key)
         width = features[column]["shape"][0]
         wanted = [(part, k, k + 1, column) for k, part in zip(range(width), parts, strict=True)]
         entries = modality[name].items()
         read = [(part, entry["start"], entry["end"], entry["original_key"]) for part, entry in entries]
         yield from unlike(dataset, {f"{name} of modality.json": read}, {f"{name} of modality.json": wanted})
-    views = convention.views(content)
+    views = layout.views
     columns = {
         "video": {"primary_image": views["image"], **views},
         "annotation": {"human.action.task_description": "task_index"},
@@ -422,14 +417,14 @@ def _wrong_modality(
 _PARTS = ("state", "action", "video", "annotation")
 
 
-def _wrong_starvla_statistics(dataset: str, root: Path, convention: Convention) -> Iterator[Fault]:
+def _wrong_starvla_statistics(dataset: str, root: Path, layout: Layout) -> Iterator[Fault]:
     """Compare starVLA's statistics with ``meta/stats.json``, which is compared with the data files."""
     stats = json.loads((root / "meta" / "stats.json").read_text())
     stored = json.loads((root / "meta" / STARVLA_STATISTICS).read_text())
     wanted = {"__format_version": 2, "__cache_config": {"mode": "abs"}}
     yield from unlike(dataset, stored, wanted, f"{STARVLA_STATISTICS}: ")
     for spec in (SCHEMA.state, SCHEMA.action):
-        column = convention.name(spec.lerobot_key)
+        column = layout.name(spec.lerobot_key)
         figures = {name: stats[column][name] for name in STARVLA_FIGURES}
         yield from unlike(dataset, stored["statistics"], {column: figures}, f"{STARVLA_STATISTICS}: ")
 

@@ -159,23 +159,38 @@ _ABSOLUTE_KEYS = {"action": "delta_action", "action_absolute": "action"}
 
 @dataclass(frozen=True)
 class Convention:
-    """Layout of a set that clients expect.
+    """Names and values that clients expect, equal in all their sets.
 
     Attributes:
-        frames: storage of the frames.
+        frames: storage of the frames in v2.1; a user chooses that of v3.0.
         robot_type: robot type in ``meta/info.json``.
         names: column of v3.0 to its name here, where the names differ.
         open_is_one: True if the gripper's command is 1 open, 0 closed, instead of LIBERO's. GR00T and starVLA, which
             read ``meta/modality.json``, expect it.
-        language: True if the set has lerobot's language columns.
-        action: content of the column ``action``.
-        depth: storage of the depth maps, if the content has them.
     """
 
     frames: Frames
     robot_type: str = SCHEMA.robot_type
     names: Mapping[str, str] = field(default_factory=dict)
     open_is_one: bool = False
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Columns of a set and their storage.
+
+    Attributes:
+        content: content of the episodes.
+        convention: names and values of the client.
+        frames: storage of the frames.
+        language: True if the set has lerobot's language columns.
+        action: content of the column ``action``.
+        depth: storage of the depth maps, if the content has them.
+    """
+
+    content: Content
+    convention: Convention
+    frames: Frames
     language: bool = False
     action: Action = "delta"
     depth: Depth = "text"
@@ -188,7 +203,7 @@ class Convention:
 
     def name(self, column: str) -> str:
         """Return the name of a column of v3.0."""
-        return self.names.get(column, column)
+        return self.convention.names.get(column, column)
 
     def camera_column(self, view: str, name: str) -> str:
         """Return the column with a view's matrix, map or boxes.
@@ -199,60 +214,66 @@ class Convention:
             return f"{self.name(ALL_VIEWS[view].lerobot_key)}_depth"
         return camera_column(view, name)
 
-    def views(self, content: Content) -> dict[str, str]:
+    @property
+    def views(self) -> dict[str, str]:
         """Map the name of each view to its column."""
-        return {view: self.name(spec.lerobot_key) for view, spec in content.cameras.items()}
+        return {view: self.name(spec.lerobot_key) for view, spec in self.content.cameras.items()}
 
-    def text_maps(self, content: Content) -> list[Extra]:
+    @property
+    def text_maps(self) -> list[Extra]:
         """List the maps that are stored as text."""
-        return [name for name in content.maps if name != "depth" or self.depth == "text"]
+        return [name for name in self.content.maps if name != "depth" or self.depth == "text"]
 
-    def depth_videos(self, content: Content) -> dict[str, str]:
+    @property
+    def depth_videos(self) -> dict[str, str]:
         """Map each view to its column of depth as video; empty where depth is text or absent."""
-        if self.depth == "text" or "depth" not in content.maps:
+        if self.depth == "text" or "depth" not in self.content.maps:
             return {}
-        return {view: self.camera_column(view, "depth") for view in content.views}
+        return {view: self.camera_column(view, "depth") for view in self.content.views}
 
-    def pictures(self, content: Content) -> dict[str, str]:
+    @property
+    def pictures(self) -> dict[str, str]:
         """Map the name of each view, and of its depth if that is a video, to its column."""
-        depths = {f"{view}_depth": column for view, column in self.depth_videos(content).items()}
-        return self.views(content) | depths
+        depths = {f"{view}_depth": column for view, column in self.depth_videos.items()}
+        return self.views | depths
 
-    def videos(self, content: Content) -> dict[str, str]:
+    @property
+    def videos(self) -> dict[str, str]:
         """Return the part of ``pictures`` that is stored as videos."""
-        columns = self.pictures(content)
+        columns = self.pictures
         if self.frames == "video":
             return columns
-        return {name: column for name, column in columns.items() if name not in content.views}
+        return {name: column for name, column in columns.items() if name not in self.content.views}
 
-    def step_kb(self, sizes: StepSizes, content: Content) -> float:
+    def step_kb(self, sizes: StepSizes) -> float:
         """Estimate the size of one step of an episode, in KB."""
-        views = len(content.views)
-        video_kb = VIEW_AS_VIDEO_KB * views * content.area
+        views = len(self.content.views)
+        video_kb = VIEW_AS_VIDEO_KB * views * self.content.area
         frames_kb = video_kb if self.frames == "video" else views * sizes.frame_kb + sizes.motion_kb
         # Depth as video counts as text here, of which it takes a third.
         return frames_kb + IN_TEXT * views * sizes.maps_kb + sizes.poses_kb
 
-    def columns(self, content: Content) -> dict[str, dict[str, Any]]:
+    @property
+    def columns(self) -> dict[str, dict[str, Any]]:
         """Describe the columns of every frame, without the encoding of videos."""
-        frame = {"dtype": "video", "shape": content.frame_shape, "names": list(SCHEMA.frame.names)}
+        frame = {"dtype": "video", "shape": self.content.frame_shape, "names": list(SCHEMA.frame.names)}
         if self.frames == "images":
             frame["dtype"] = "image"
         text, number = ({"dtype": dtype, "shape": (1,), "names": None} for dtype in ("string", "int64"))
-        columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in content.cameras.values()}
+        columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in self.content.cameras.values()}
         for name, key in self.motion_keys.items():
             spec = getattr(SCHEMA, name)
             columns[key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
         columns[EPISODE_ID] = dict(text)
-        columns |= {camera_column(view, name): dict(text) for view in content.views for name in self.text_maps(content)}
-        height, width, _ = content.frame_shape
-        for column in self.depth_videos(content).values():
+        columns |= {camera_column(view, name): dict(text) for view in self.content.views for name in self.text_maps}
+        height, width, _ = self.content.frame_shape
+        for column in self.depth_videos.values():
             columns[column] = {"dtype": "video", "shape": (height, width, 1), "names": list(SCHEMA.frame.names)}
-        if "boxes" in content.extras:
-            columns |= {camera_column(view, "boxes"): _flat(SCHEMA.boxes) for view in content.views}
-        if "object_poses" in content.extras:
+        if "boxes" in self.content.extras:
+            columns |= {camera_column(view, "boxes"): _flat(SCHEMA.boxes) for view in self.content.views}
+        if "object_poses" in self.content.extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
-        if "outcome" in content.extras:
+        if "outcome" in self.content.extras:
             columns[IS_SUCCESS] = {"dtype": "bool", "shape": (1,), "names": None}
         if self.language:
             columns |= {name: {"dtype": "language", "shape": (1,), "names": None} for name in (LANGUAGE, EVENTS)}
@@ -260,11 +281,12 @@ class Convention:
         columns |= {name: dict(number) for name in COUNTERS}
         return {self.name(column): description for column, description in columns.items()}
 
-    def described(self, content: Content) -> dict[str, dict[str, Any]]:
+    @property
+    def described(self) -> dict[str, dict[str, Any]]:
         """Describe the columns as ``meta/info.json`` does, videos with the properties of their encoding."""
-        depths = set(self.depth_videos(content).values())
+        depths = set(self.depth_videos.values())
         columns = {}
-        for name, description in self.columns(content).items():
+        for name, description in self.columns.items():
             columns[name] = dict(description)
             if description["dtype"] == "video":
                 size = dict(zip(("video.height", "video.width", "video.channels"), description["shape"], strict=True))

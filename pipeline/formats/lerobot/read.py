@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, Content
+from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.lerobot.columns import (
@@ -25,7 +25,7 @@ from pipeline.formats.lerobot.columns import (
     IS_SUCCESS,
     LANGUAGE,
     OBJECT_POSES,
-    Convention,
+    Layout,
     camera_column,
     data_path_v21,
     matrix,
@@ -57,15 +57,15 @@ NUMBERS = ("float32", "int64")
 """Types of the columns that have statistics, in addition to frames."""
 
 
-def read(root: Path, episode_id: str, content: Content, convention: Convention) -> Copy | None:
-    """Read an episode with this content; ``None`` when the dataset does not have it.
+def read(root: Path, episode_id: str, layout: Layout) -> Copy | None:
+    """Read an episode of this layout; ``None`` when the dataset does not have it.
 
     Raises:
         PipelineError: when the episode cannot be read.
     """
     with readable(root):
         row = rows(root).get(episode_id)
-        return None if row is None else copy_of(root, row, content, convention)
+        return None if row is None else copy_of(root, row, layout)
 
 
 @contextmanager
@@ -110,21 +110,21 @@ def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
     return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
 
 
-def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Convention) -> Copy:
+def copy_of(root: Path, row: Mapping[str, Any], layout: Layout) -> Copy:
     """Read an episode with LIBERO's gripper, given its row of ``rows``."""
     index, steps = row["episode_index"], row["length"]
     info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)
     stored = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
     reject_others(stored, row, row["dataset_from_index"])
-    table = _v30_columns(stored, convention)
+    table = _v30_columns(stored, layout)
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
     if row["dataset_to_index"] != row["dataset_from_index"] + steps or row["tasks"] != [instructions[0]]:
         stated = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
         raise ValueError(f"episode {index} of {steps} steps, {instructions[0]!r}, {stated}")
-    depth_columns = convention.depth_videos(content)
+    depth_columns = layout.depth_videos
     videos, depth_videos = {}, {}
-    views = convention.views(content)
+    views = layout.views
     for view, column in views.items():
         if info["features"][column]["dtype"] == "video":
             videos[view] = _video_place(root, info, row, column)
@@ -134,7 +134,7 @@ def copy_of(root: Path, row: Mapping[str, Any], content: Content, convention: Co
     codes = decoded(times_s, depth_videos, PIXEL_FORMAT)
     return Copy(
         dataset="lerobot",
-        episode=episode(table, row, instructions[0], content, convention),
+        episode=episode(table, row, instructions[0], layout),
         instructions=instructions,
         decoded=decoded(times_s, videos),
         marks=_marks(table),
@@ -213,19 +213,17 @@ def reject_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
             raise ValueError(f"by {name}, these are not the {steps} steps of episode {index}")
 
 
-def episode(
-    table: pa.Table, row: Mapping[str, Any], instruction: str, content: Content, convention: Convention
-) -> Episode:
+def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, layout: Layout) -> Episode:
     """Return an episode with LIBERO's gripper, given v3.0's columns of its steps and its row of the files in ``meta/``.
 
     The episode has frames only where they are stored as image files.
     """
     frames = {}
-    for view, spec in content.cameras.items():
+    for view, spec in layout.content.cameras.items():
         if spec.lerobot_key in table.column_names:
             frames[view] = [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
-    motion = {name: matrix(table, key) for name, key in convention.motion_keys.items()}
-    if convention.open_is_one:
+    motion = {name: matrix(table, key) for name, key in layout.motion_keys.items()}
+    if layout.convention.open_is_one:
         motion |= {name: libero_gripper(motion[name]) for name in ("action", "action_absolute")}
     return Episode(
         episode_id=row[EPISODE_ID],
@@ -236,9 +234,9 @@ def episode(
         action_absolute=motion["action_absolute"],
         instruction=instruction,
         provenance=row,
-        geometry={view: _geometry(table, row, view, content, convention) for view in content.views},
-        object_poses=_object_poses(table) if "object_poses" in content.extras else None,
-        instances=json.loads(row[INSTANCES]) if content.has_names else (),
+        geometry={view: _geometry(table, row, view, layout) for view in layout.content.views},
+        object_poses=_object_poses(table) if "object_poses" in layout.content.extras else None,
+        instances=json.loads(row[INSTANCES]) if layout.content.has_names else (),
         rewrites=row["rewrites"],
         subtasks=subtasks_of(row["subtask_starts"], row["subtask_texts"]),
     )
@@ -249,9 +247,9 @@ def libero_gripper(action: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.hstack([action[:, :-1], 1 - 2 * action[:, -1:]])
 
 
-def _v30_columns(stored: pa.Table, convention: Convention) -> pa.Table:
+def _v30_columns(stored: pa.Table, layout: Layout) -> pa.Table:
     """Return the columns of a data file under the names of v3.0."""
-    v30_names = {name: v30_name for v30_name, name in convention.names.items()}
+    v30_names = {name: v30_name for v30_name, name in layout.convention.names.items()}
     return stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
 
 
@@ -281,15 +279,15 @@ def _object_poses(table: pa.Table) -> NDArray[np.float32]:
     return matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
 
 
-def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, content: Content, convention: Convention) -> Geometry:
+def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, layout: Layout) -> Geometry:
     matrices = {}
     for name in MATRICES:
         numbers = np.array(row[camera_column(view, name)], np.float32)
         matrices[name] = numbers.reshape(getattr(SCHEMA, name).shape)
-    texts = {name: table[camera_column(view, name)].to_pylist() for name in convention.text_maps(content)}
+    texts = {name: table[camera_column(view, name)].to_pylist() for name in layout.text_maps}
     maps = {name: list(map(base64.b64decode, files)) for name, files in texts.items()}
     boxes = None
-    if "boxes" in content.extras:
+    if "boxes" in layout.content.extras:
         boxes = matrix(table, camera_column(view, "boxes")).reshape(-1, *SCHEMA.boxes.shape)
     return Geometry(**matrices, maps=maps, boxes=boxes)
 
@@ -366,8 +364,8 @@ def open_all_v21(folder: Path) -> None:
             opened_v21(root)
 
 
-def read_v21(folder: Path, episode_id: str, convention: Convention, content: Content) -> Copy | None:
-    """Read an episode with this content, under v3.0's names and with LIBERO's gripper; ``None`` when no set has it.
+def read_v21(folder: Path, episode_id: str, layout: Layout) -> Copy | None:
+    """Read an episode of this layout, under v3.0's names and with LIBERO's gripper; ``None`` when no set has it.
 
     Raises:
         PipelineError: when the episode cannot be read.
@@ -376,7 +374,7 @@ def read_v21(folder: Path, episode_id: str, convention: Convention, content: Con
         with readable(root, VERSION_V21):
             info, rows, tasks = opened_v21(root)
             if episode_id in rows:
-                return _copy_v21(root, info, rows[episode_id], tasks, convention, content)
+                return _copy_v21(root, info, rows[episode_id], tasks, layout)
     return None
 
 
@@ -385,8 +383,7 @@ def _copy_v21(
     info: Mapping[str, Any],
     row: Mapping[str, Any],
     tasks: Mapping[int, str],
-    convention: Convention,
-    content: Content,
+    layout: Layout,
 ) -> Copy:
     index = row["episode_index"]
     stored = pq.read_table(root / data_path_v21(index))
@@ -394,12 +391,10 @@ def _copy_v21(
     instructions = [tasks[task] for task in stored["task_index"].to_pylist()]
     if row["tasks"] != [instructions[0]]:
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
-    table = _v30_columns(stored, convention)
-    made = episode(table, row, instructions[0], content, convention)
-    keys = convention.views(content)
-    videos = {
-        view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"
-    }
+    table = _v30_columns(stored, layout)
+    made = episode(table, row, instructions[0], layout)
+    keys = layout.views
+    videos = {view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if layout.frames == "video"}
     numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
     statistics = Statistics(_statistics_v21(root, index), numbers, keys)
     frames = decoded(table["timestamp"].to_pylist(), videos)

@@ -56,7 +56,7 @@ from pipeline.formats.lerobot.columns import (
     VIDEO_INFO,
     VIDEO_PATH,
     VIDEO_PATH_V21,
-    Convention,
+    Layout,
     camera_column,
     data_path_v21,
     matrix_columns,
@@ -159,9 +159,7 @@ def planes(pixels: Frame) -> NDArray[np.uint8]:
 # Content of an episode.
 
 
-def _load_each(
-    piece: Piece, load: Load, convention: Convention, content: Content
-) -> Iterator[tuple[int, int, Episode, Numbers]]:
+def _load_each(piece: Piece, load: Load, layout: Layout) -> Iterator[tuple[int, int, Episode, Numbers]]:
     """Load and check each episode of a piece.
 
     Yields:
@@ -173,14 +171,14 @@ def _load_each(
     first_step = piece.first_step
     for index, episode_id in enumerate(piece.ids, piece.first_episode):
         episode = load(episode_id)
-        check(episode, content)
-        if convention.open_is_one:
+        check(episode, layout.content)
+        if layout.convention.open_is_one:
             episode = replace(
                 episode,
                 action=open_is_one(episode.action),
                 action_absolute=open_is_one(episode.action_absolute),
             )
-        yield index, first_step, episode, _numbers(episode, index, first_step, piece, convention)
+        yield index, first_step, episode, _numbers(episode, index, first_step, piece, layout)
         first_step += len(episode)
 
 
@@ -234,9 +232,9 @@ def _append_depth(episode: Episode, view: str, video: DepthVideo) -> Counts:
     return counts[None]
 
 
-def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, convention: Convention) -> Numbers:
+def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, layout: Layout) -> Numbers:
     steps, task = np.arange(len(episode)), piece.tasks[episode.instruction]
-    numbers: dict[str, NDArray[Any]] = {key: getattr(episode, name) for name, key in convention.motion_keys.items()}
+    numbers: dict[str, NDArray[Any]] = {key: getattr(episode, name) for name, key in layout.motion_keys.items()}
     if episode.object_poses is not None:
         numbers[OBJECT_POSES] = episode.object_poses.reshape(len(steps), -1)
     for view, geometry in episode.geometry.items():
@@ -251,7 +249,7 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, conven
     }
 
 
-def _step_columns(episode: Episode, numbers: Numbers, convention: Convention, content: Content) -> dict[str, pa.Array]:
+def _step_columns(episode: Episode, numbers: Numbers, layout: Layout) -> dict[str, pa.Array]:
     """Return the columns of an episode's steps, with its images if they are stored as such.
 
     Args:
@@ -259,10 +257,10 @@ def _step_columns(episode: Episode, numbers: Numbers, convention: Convention, co
     """
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, geometry in episode.geometry.items():
-        for extra in convention.text_maps(content):
+        for extra in layout.text_maps:
             texts[camera_column(view, extra)] = [base64.b64encode(file).decode() for file in geometry.maps[extra]]
     images = {}
-    if convention.frames == "images":
+    if layout.frames == "images":
         image_type = datasets.Image().pa_type
         for view, files in episode.frames.items():
             cells = [{"bytes": packed, "path": None} for packed in files]
@@ -273,10 +271,10 @@ def _step_columns(episode: Episode, numbers: Numbers, convention: Convention, co
             stored[name] = pa.array(values)
         else:
             stored[name] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
-    if "outcome" in content.extras:
+    if "outcome" in layout.content.extras:
         stored[IS_SUCCESS] = pa.array([episode.provenance["success"]] * len(episode))
     columns = stored | {name: pa.array(values) for name, values in texts.items()} | images
-    return {convention.name(name): values for name, values in columns.items()}
+    return {layout.name(name): values for name, values in columns.items()}
 
 
 def _picture_statistics(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
@@ -285,19 +283,19 @@ def _picture_statistics(counts: Counts, frames: int) -> dict[str, NDArray[Any]]:
 
 
 def _episode_statistics(
-    numbers: Numbers, levels: Mapping[str, Counts], convention: Convention, content: Content
+    numbers: Numbers, levels: Mapping[str, Counts], layout: Layout
 ) -> dict[str, dict[str, NDArray[Any]]]:
     """Compute lerobot's statistics of an episode by column: (D,) of numbers, (3, 1, 1) of frames; ``count`` is (1,).
 
     Args:
         numbers: the columns of numbers, under the names of v3.0.
-        levels: counts of levels by the names of ``Convention.pictures``.
+        levels: counts of levels by the names of ``Layout.pictures``.
     """
-    columns = convention.pictures(content)
+    columns = layout.pictures
     of_numbers = {}
     for name, values in numbers.items():
         rows = values.reshape(len(values), -1)
-        of_numbers[convention.name(name)] = describe(rows, QUANTILES) | {"count": np.array([len(values)])}
+        of_numbers[layout.name(name)] = describe(rows, QUANTILES) | {"count": np.array([len(values)])}
     steps = len(numbers["timestamp"])
     return of_numbers | {columns[name]: _picture_statistics(counts, steps) for name, counts in levels.items()}
 
@@ -340,16 +338,14 @@ def _write_summary(
     (path / LEVELS).write_text(json.dumps(levels))
 
 
-def _write_common(
-    work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, content: Content
-) -> dict[str, int]:
+def _write_common(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> dict[str, int]:
     """Write provenance and exact statistics of a dataset whose data files exist, and return its numbered tasks."""
     tables = [pq.read_table(work / piece.path / PROVENANCE) for piece in pieces]
     pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
-    columns = convention.columns(content)
+    columns = layout.columns
     levels_of_pieces = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
     figures = {}
-    for picture, column in convention.pictures(content).items():
+    for picture, column in layout.pictures.items():
         total = np.sum([levels[picture] for levels in levels_of_pieces], axis=0)
         steps = pieces[-1].first_step + pieces[-1].steps
         figures[column] = _picture_statistics(total, steps)
@@ -361,11 +357,11 @@ def _write_common(
     return {task: number for piece in pieces for task, number in piece.tasks.items()}
 
 
-def _totals(version: str, last: Piece, tasks: int, convention: Convention) -> dict[str, Any]:
+def _totals(version: str, last: Piece, tasks: int, layout: Layout) -> dict[str, Any]:
     """Return the first fields of ``meta/info.json`` of a dataset whose last piece is ``last``."""
     return {
         "codebase_version": version,
-        "robot_type": convention.robot_type,
+        "robot_type": layout.convention.robot_type,
         "total_episodes": last.first_episode + len(last.ids),
         "total_frames": last.first_step + last.steps,
         "total_tasks": tasks,
@@ -385,7 +381,7 @@ def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
     return figures | {"count": np.array([len(values)])}
 
 
-def _write_modality(root: Path, convention: Convention, content: Content) -> None:
+def _write_modality(root: Path, layout: Layout) -> None:
     """Write ``meta/modality.json``, by which GR00T and starVLA find their inputs.
 
     Both expect 1 for an open gripper and 0 for a closed one, so only datasets with this gripper have the file.
@@ -400,18 +396,18 @@ def _write_modality(root: Path, convention: Convention, content: Content) -> Non
         return {name: {"start": k, "end": k + 1, "original_key": column} for k, name in enumerate(names)}
 
     pose = ("x", "y", "z", "roll", "pitch", "yaw")
-    views = convention.views(content)
+    views = layout.views
     videos = {"primary_image": views["image"], **views}
     modality = {
-        "state": entries(convention.name(SCHEMA.state.lerobot_key), *pose, "pad", "gripper"),
-        "action": entries(convention.name(SCHEMA.action.lerobot_key), *pose, "gripper"),
+        "state": entries(layout.name(SCHEMA.state.lerobot_key), *pose, "pad", "gripper"),
+        "action": entries(layout.name(SCHEMA.action.lerobot_key), *pose, "gripper"),
         "video": {name: {"original_key": column} for name, column in videos.items()},
         "annotation": {"human.action.task_description": {"original_key": "task_index"}},
     }
     _write_json(root / "meta" / "modality.json", modality)
 
 
-def _write_starvla_statistics(root: Path, convention: Convention) -> None:
+def _write_starvla_statistics(root: Path, layout: Layout) -> None:
     """Write the part of ``meta/stats.json`` that starVLA normalises by, in the form of its cache.
 
     InternVLA-M1 and DiT4DiT have another form of a file of this name. They reject this one and write theirs over it.
@@ -419,7 +415,7 @@ def _write_starvla_statistics(root: Path, convention: Convention) -> None:
     stats = json.loads((root / "meta" / "stats.json").read_text())
     statistics = {}
     for spec in (SCHEMA.state, SCHEMA.action):
-        column = convention.name(spec.lerobot_key)
+        column = layout.name(spec.lerobot_key)
         statistics[column] = {figure: stats[column][figure] for figure in STARVLA_FIGURES}
     content = {"__format_version": 2, "__cache_config": {"mode": "abs"}, "statistics": statistics}
     _write_json(root / "meta" / STARVLA_STATISTICS, content)
@@ -448,7 +444,7 @@ def file_path(kind: str, number: int, suffix: str) -> str:
     return f"{kind}/{PLACE.format(chunk_index=chunk, file_index=file)}{suffix}"
 
 
-def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, content: Content) -> None:
+def write_piece(path: Path, piece: Piece, load: Load, layout: Layout) -> None:
     """Write the files of a piece's episodes into a new folder, with one episode at a time in memory.
 
     The bytes, including those of videos, depend only on the episodes, their order and the encoder's version.
@@ -459,31 +455,31 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, co
     path.mkdir()
     rows, summaries = [], []
     with ExitStack() as opened:
-        data = opened.enter_context(pq.ParquetWriter(path / DATA, _data_schema(convention.columns(content))))
+        data = opened.enter_context(pq.ParquetWriter(path / DATA, _data_schema(layout.columns)))
         videos, depth_videos = {}, {}
-        if convention.frames == "video":
-            for view in content.views:
-                videos[view] = opened.enter_context(Video(path / f"{view}.mp4", content))
-        for view in convention.depth_videos(content):
-            depth_videos[view] = opened.enter_context(DepthVideo(path / f"{view}_depth.mp4", content))
-        for index, first_step, episode, numbers in _load_each(piece, load, convention, content):
-            levels = {view: _append_frames(episode, view, videos.get(view)) for view in content.views}
+        if layout.frames == "video":
+            for view in layout.content.views:
+                videos[view] = opened.enter_context(Video(path / f"{view}.mp4", layout.content))
+        for view in layout.depth_videos:
+            depth_videos[view] = opened.enter_context(DepthVideo(path / f"{view}_depth.mp4", layout.content))
+        for index, first_step, episode, numbers in _load_each(piece, load, layout):
+            levels = {view: _append_frames(episode, view, videos.get(view)) for view in layout.content.views}
             for view, video in depth_videos.items():
                 levels[f"{view}_depth"] = _append_depth(episode, view, video)
-            columns = _step_columns(episode, numbers, convention, content)
-            if convention.language:
-                columns |= language_columns(episode, content.size_px, train=piece.split == "train")
+            columns = _step_columns(episode, numbers, layout)
+            if layout.language:
+                columns |= language_columns(episode, layout.content.size_px, train=piece.split == "train")
             # Each episode is a row group of its own, so that it can be read alone.
             table = pa.table({name: columns[name] for name in data.schema.names})
             data.write_table(table.cast(data.schema))
-            row = _episode_row(episode, piece, index, first_step, convention.videos(content).values())
+            row = _episode_row(episode, piece, index, first_step, layout.videos.values())
             # lerobot's tools for editing aggregate the statistics of the episodes.
-            for name, figures in _episode_statistics(numbers, levels, convention, content).items():
+            for name, figures in _episode_statistics(numbers, levels, layout).items():
                 row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
             rows.append(row)
             summaries.append((_provenance_row(episode, index), levels))
     pq.write_table(_episodes_table(rows), path / EPISODES)
-    _write_summary(path, summaries, content)
+    _write_summary(path, summaries, layout.content)
 
 
 def _episodes_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
@@ -499,16 +495,16 @@ def _episodes_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
     return table
 
 
-def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, content: Content) -> None:
+def finish(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> None:
     """Link the files of all pieces to their places below ``root``, and write the files about all episodes."""
     for piece in pieces:
         places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
-        places |= {f"{name}.mp4": (f"videos/{column}", ".mp4") for name, column in convention.videos(content).items()}
+        places |= {f"{name}.mp4": (f"videos/{column}", ".mp4") for name, column in layout.videos.items()}
         for name, (kind, suffix) in places.items():
             made = work / piece.path / name
             if made.exists():
                 _link(made, root / file_path(kind, piece.number, suffix))
-    tasks = _write_common(work, root, pieces, convention, content)
+    tasks = _write_common(work, root, pieces, layout)
     # lerobot finds a task by the table's index.
     numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
     table = pa.table(numbered).replace_schema_metadata({"pandas": INDEX})
@@ -518,15 +514,15 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
         first, _ = splits.get(piece.split, (piece.first_episode, 0))
         splits[piece.split] = (first, piece.first_episode + len(piece.ids))
     info = {
-        **_totals("v3.0", pieces[-1], len(tasks), convention),
+        **_totals("v3.0", pieces[-1], len(tasks), layout),
         "chunks_size": FILES_OF_A_CHUNK,
         "data_files_size_in_mb": FILE_MB,
         "video_files_size_in_mb": FILE_MB,
         "fps": SCHEMA.fps_hz,
         "splits": {name: f"{first}:{end}" for name, (first, end) in splits.items()},
         "data_path": DATA_PATH,
-        "video_path": VIDEO_PATH if convention.videos(content) else None,
-        "features": convention.described(content),
+        "video_path": VIDEO_PATH if layout.videos else None,
+        "features": layout.described,
     }
     _write_json(root / "meta" / "info.json", info)
 
@@ -563,7 +559,7 @@ def _episode_row(
 # Version 2.1.
 
 
-def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention, content: Content) -> None:
+def write_piece_v21(path: Path, piece: Piece, load: Load, layout: Layout) -> None:
     """Write the files of a piece's episodes into a new folder, under the paths of their set.
 
     The bytes, including those of videos, depend only on the episodes, their order and the encoder's version.
@@ -575,17 +571,17 @@ def write_piece_v21(path: Path, piece: Piece, load: Load, convention: Convention
     summaries = []
     with ExitStack() as opened:
         episodes, stats = (opened.enter_context((path / name).open("w")) for name in LINES_V21)
-        for index, _, episode, numbers in _load_each(piece, load, convention, content):
-            levels = _write_episode_v21(path, index, episode, numbers, convention, content)
+        for index, _, episode, numbers in _load_each(piece, load, layout):
+            levels = _write_episode_v21(path, index, episode, numbers, layout)
             figures = {}
-            for name, all_figures in _episode_statistics(numbers, levels, convention, content).items():
+            for name, all_figures in _episode_statistics(numbers, levels, layout).items():
                 figures[name] = listed({figure: all_figures[figure] for figure in STATISTICS_V21})
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
             row |= {"episode_id": episode.episode_id, **labels_of(episode)}
             episodes.write(json.dumps(row) + "\n")
             stats.write(json.dumps({"episode_index": index, "stats": figures}) + "\n")
             summaries.append((_provenance_row(episode, index), levels))
-    _write_summary(path, summaries, content)
+    _write_summary(path, summaries, layout.content)
 
 
 def _write_episode_v21(
@@ -593,21 +589,20 @@ def _write_episode_v21(
     index: int,
     episode: Episode,
     numbers: Numbers,
-    convention: Convention,
-    content: Content,
+    layout: Layout,
 ) -> dict[str, Counts]:
     """Write the files of one episode and return the counts of levels of its views."""
     levels = {}
-    for view, column in convention.views(content).items():
-        if convention.frames == "video":
+    for view, column in layout.views.items():
+        if layout.frames == "video":
             file = path / video_path_v21(index, column)
             file.parent.mkdir(parents=True, exist_ok=True)
-            with Video(file, content) as video:
+            with Video(file, layout.content) as video:
                 levels[view] = _append_frames(episode, view, video)
         else:
             levels[view] = _append_frames(episode, view, None)
-    columns = _step_columns(episode, numbers, convention, content)
-    schema = _data_schema_v21(convention, content)
+    columns = _step_columns(episode, numbers, layout)
+    schema = _data_schema_v21(layout)
     file = path / data_path_v21(index)
     file.parent.mkdir(parents=True, exist_ok=True)
     table = pa.table({name: columns[name] for name in schema.names})
@@ -615,14 +610,14 @@ def _write_episode_v21(
     return levels
 
 
-def _data_schema_v21(convention: Convention, content: Content) -> pa.Schema:
-    schema = _data_schema(convention.columns(content))
+def _data_schema_v21(layout: Layout) -> pa.Schema:
+    schema = _data_schema(layout.columns)
     # datasets 4 names a list differently from the clients' versions 2 and 3, but also reads their name.
     metadata = schema.metadata or {}
     return schema.with_metadata({name: value.replace(b'"List"', b'"Sequence"') for name, value in metadata.items()})
 
 
-def finish_v21(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, content: Content) -> None:
+def finish_v21(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> None:
     """Link the files of a set's pieces to their places below ``root``, and write the files about all episodes."""
     (root / "meta").mkdir(parents=True)
     for piece in pieces:
@@ -631,23 +626,23 @@ def finish_v21(work: Path, root: Path, pieces: Sequence[Piece], convention: Conv
     for name in LINES_V21:
         texts = [(work / piece.path / name).read_text() for piece in pieces]
         (root / "meta" / name).write_text("".join(texts))
-    tasks = _write_common(work, root, pieces, convention, content)
+    tasks = _write_common(work, root, pieces, layout)
     rows = [{"task_index": number, "task": task} for task, number in tasks.items()]
     (root / "meta" / "tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    if convention.open_is_one:
-        _write_modality(root, convention, content)
-        _write_starvla_statistics(root, convention)
-    totals = _totals("v2.1", pieces[-1], len(tasks), convention)
-    episodes, videos = totals["total_episodes"], convention.frames == "video"
+    if layout.convention.open_is_one:
+        _write_modality(root, layout)
+        _write_starvla_statistics(root, layout)
+    totals = _totals("v2.1", pieces[-1], len(tasks), layout)
+    episodes, videos = totals["total_episodes"], layout.frames == "video"
     info = {
         **totals,
-        "total_videos": episodes * len(content.views) if videos else 0,
+        "total_videos": episodes * len(layout.content.views) if videos else 0,
         "total_chunks": -(-episodes // FILES_OF_A_CHUNK),
         "chunks_size": FILES_OF_A_CHUNK,
         "fps": SCHEMA.fps_hz,
         "splits": {"train": f"0:{episodes}"},
         "data_path": DATA_PATH_V21,
         "video_path": VIDEO_PATH_V21 if videos else None,
-        "features": convention.described(content),
+        "features": layout.described,
     }
     _write_json(root / "meta" / "info.json", info)
