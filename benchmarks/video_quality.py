@@ -29,7 +29,7 @@ from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.lerobot.write import Video
+from pipeline.formats.lerobot.video import Video
 from pipeline.images.jpeg import decode, encode, to_policy
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.machine_code import ensure_fixed_machine_code

@@ -85,7 +85,7 @@ AXIS_IS_SUBJECT = {
     # The axis whose exported episodes are no demonstrations.
     "pipeline.libero.demonstrations",
     # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
-    *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write"),
+    *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write_shared"),
     *("pipeline.formats.lerobot.language", "pipeline.validation.checks"),
     *("pipeline.evaluation.harness", "pipeline.rendering.geometry"),
     *("pipeline.rewriting.rewrite", "pipeline.report.paper_rows"),

@@ -19,7 +19,7 @@ from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
 from pipeline.formats.lerobot.columns import ENCODER, ENCODER_OPTIONS
-from pipeline.formats.lerobot.write import planes
+from pipeline.formats.lerobot.video import planes
 from pipeline.formats.read_back import Copy, Statistics, sampled
 from pipeline.formats.registry import FORMATS
 from pipeline.formats.stated_statistics import DEVIATION, FIGURES, MEAN_LEVELS

@@ -22,7 +22,7 @@ from pipeline.episode_schema import SCHEMA, Content
 from pipeline.formats import lerobot as lerobot_format
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.lerobot.columns import FILE_MB
-from pipeline.formats.lerobot.write import Video
+from pipeline.formats.lerobot.video import Video
 
 
 @pytest.fixture(scope="module")

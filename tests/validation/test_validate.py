@@ -21,7 +21,7 @@ from pipeline.config import RenderConfig, ReplayConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum
 from pipeline.formats import rlds_write
-from pipeline.formats.lerobot.write import Video
+from pipeline.formats.lerobot.video import Video
 from pipeline.formats.read_back import Copy
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.images.jpeg import decode, encode

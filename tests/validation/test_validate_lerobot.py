@@ -19,7 +19,7 @@ from pipeline.config import Config, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats.lerobot import LeRobot, LeRobotV21, LeRobotV21Config
-from pipeline.formats.lerobot.write import Video
+from pipeline.formats.lerobot.video import Video
 from pipeline.formats.read_back import Fault
 from pipeline.run import manifest
 from pipeline.run.export import episodes_of, export

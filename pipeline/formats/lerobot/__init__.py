@@ -348,31 +348,31 @@ class LeRobotV21(Format[LeRobotV21Config]):
         return pieces
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
-        from pipeline.formats.lerobot import write
+        from pipeline.formats.lerobot import write_v21
 
-        write.write_piece_v21(path, piece, load, self.layout)
+        write_v21.write_piece(path, piece, load, self.layout)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
-        from pipeline.formats.lerobot import write
+        from pipeline.formats.lerobot import write_v21
 
         for name, members in grouped((Path(piece.path).parent.name, piece) for piece in pieces).items():
-            write.finish_v21(work, work / "dataset" / name, members, self.layout)
+            write_v21.finish(work, work / "dataset" / name, members, self.layout)
         return {}
 
     def open(self) -> None:
-        from pipeline.formats.lerobot import read
+        from pipeline.formats.lerobot import read_v21
 
-        read.open_all_v21(self.folder)
+        read_v21.open_all(self.folder)
 
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
-        from pipeline.formats.lerobot import check
+        from pipeline.formats.lerobot import check_v21
 
-        return check.check_v21(self.folder, kept, self.layout, self.options.validation)
+        return check_v21.check(self.folder, kept, self.layout, self.options.validation)
 
     def read(self, row: Row) -> Copy | None:
-        from pipeline.formats.lerobot import read
+        from pipeline.formats.lerobot import read_v21
 
-        return read.read_v21(self.folder, row["episode_id"], self.layout)
+        return read_v21.read(self.folder, row["episode_id"], self.layout)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         actions = self.keys["action"]

@@ -1,11 +1,10 @@
-"""Reader of single episodes of LeRobot datasets, v3.0 and v2.1, by PyArrow and PyAV; lerobot reads in ``check.py``."""
+"""Reader of single episodes of LeRobot v3.0 by PyArrow and PyAV; lerobot itself reads in ``check.py``."""
 
 import base64
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA
+from pipeline.episode_schema import MATRICES, SCHEMA
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.lerobot.columns import (
@@ -27,11 +26,10 @@ from pipeline.formats.lerobot.columns import (
     OBJECT_POSES,
     Layout,
     camera_column,
-    data_path_v21,
     matrix,
-    video_path_v21,
 )
 from pipeline.formats.lerobot.depth import PIXEL_FORMAT, metres_of
+from pipeline.formats.lerobot.video import frames_at
 from pipeline.formats.read_back import Copy, Statistics, sampled, subtasks_of
 from pipeline.formats.stated_statistics import QUANTILE_NAMES
 from pipeline.types import Episode, Geometry
@@ -117,7 +115,7 @@ def copy_of(root: Path, row: Mapping[str, Any], layout: Layout) -> Copy:
     chunk, number = _file(row)
     stored = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
     reject_others(stored, row, row["dataset_from_index"])
-    table = _v30_columns(stored, layout)
+    table = v30_columns(stored, layout)
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
     if row["dataset_to_index"] != row["dataset_from_index"] + steps or row["tasks"] != [instructions[0]]:
         stated = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
@@ -137,7 +135,7 @@ def copy_of(root: Path, row: Mapping[str, Any], layout: Layout) -> Copy:
         episode=episode(table, row, instructions[0], layout),
         instructions=instructions,
         decoded=decoded(times_s, videos),
-        marks=_marks(table),
+        marks=marks(table),
         place={"lerobot_episode_index": index},
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
         events=table[EVENTS].to_pylist() if EVENTS in table.column_names else None,
@@ -247,13 +245,14 @@ def libero_gripper(action: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.hstack([action[:, :-1], 1 - 2 * action[:, -1:]])
 
 
-def _v30_columns(stored: pa.Table, layout: Layout) -> pa.Table:
+def v30_columns(stored: pa.Table, layout: Layout) -> pa.Table:
     """Return the columns of a data file under the names of v3.0."""
     v30_names = {name: v30_name for v30_name, name in layout.convention.names.items()}
     return stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
 
 
-def _marks(table: pa.Table) -> dict[str, NDArray[Any]]:
+def marks(table: pa.Table) -> dict[str, NDArray[Any]]:
+    """Return the columns of ``MARKS`` that a table has."""
     return {name: table[name].to_numpy() for name in MARKS if name in table.column_names}
 
 
@@ -312,140 +311,3 @@ def decoded(
         for step, frame in zip(steps, frames_of_view, strict=True):
             frames[view, step] = frame
     return frames
-
-
-def frames_at(path: Path, times_s: Sequence[float], pixel_format: str = "rgb24") -> list[NDArray[Any]]:
-    """Decode the frames of a video that begin at these times.
-
-    Raises:
-        ValueError: when no frame begins at a time.
-    """
-    video, frames = _video(edition(path)), []
-    stream = video.streams.video[0]
-    for at_s in times_s:
-        at = round(at_s / float(stream.time_base or 1))
-        video.seek(at, stream=stream)
-        from_then_on = (frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at)
-        frame = next(from_then_on, None)
-        if frame is None or frame.pts != at:
-            raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
-        frames.append(frame.to_ndarray(format=pixel_format))
-    return frames
-
-
-_VIDEOS: dict[Edition, av.container.InputContainer] = {}
-"""Open videos, as many as an episode may have, with those of depth."""
-
-
-def _video(file: Edition) -> av.container.InputContainer:
-    """Open a video and keep it open for a while, because a caller probably asks for its next frames."""
-    if file not in _VIDEOS:
-        while len(_VIDEOS) >= 2 * len(ALL_VIEWS):
-            _VIDEOS.pop(next(iter(_VIDEOS))).close()
-        _VIDEOS[file] = av.open(str(file.path))
-        _VIDEOS[file].streams.video[0].thread_count = 1  # Starting more takes longer than a few frames.
-    return _VIDEOS[file]
-
-
-# Version 2.1.
-
-
-VERSION_V21 = "v2.1"
-
-
-def open_all_v21(folder: Path) -> None:
-    """Read the metadata of every set.
-
-    Raises:
-        PipelineError: when the metadata cannot be read.
-    """
-    for root in sets_v21(folder):
-        with readable(root, VERSION_V21):
-            opened_v21(root)
-
-
-def read_v21(folder: Path, episode_id: str, layout: Layout) -> Copy | None:
-    """Read an episode of this layout, under v3.0's names and with LIBERO's gripper; ``None`` when no set has it.
-
-    Raises:
-        PipelineError: when the episode cannot be read.
-    """
-    for root in sets_v21(folder):
-        with readable(root, VERSION_V21):
-            info, rows, tasks = opened_v21(root)
-            if episode_id in rows:
-                return _copy_v21(root, info, rows[episode_id], tasks, layout)
-    return None
-
-
-def _copy_v21(
-    root: Path,
-    info: Mapping[str, Any],
-    row: Mapping[str, Any],
-    tasks: Mapping[int, str],
-    layout: Layout,
-) -> Copy:
-    index = row["episode_index"]
-    stored = pq.read_table(root / data_path_v21(index))
-    reject_others(stored, row, row["first_step"])
-    instructions = [tasks[task] for task in stored["task_index"].to_pylist()]
-    if row["tasks"] != [instructions[0]]:
-        raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
-    table = _v30_columns(stored, layout)
-    made = episode(table, row, instructions[0], layout)
-    keys = layout.views
-    videos = {view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if layout.frames == "video"}
-    numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
-    statistics = Statistics(_statistics_v21(root, index), numbers, keys)
-    frames = decoded(table["timestamp"].to_pylist(), videos)
-    return Copy(root.parent.name, made, instructions, frames, _marks(table), {}, statistics=statistics)
-
-
-def _statistics_v21(root: Path, index: int) -> dict[str, Any]:
-    """Read the statistics of an episode's columns in ``meta/episodes_stats.jsonl``."""
-    file = root / "meta" / "episodes_stats.jsonl"
-    with file.open("rb") as lines:
-        lines.seek(_begins(edition(file))[index])
-        line = json.loads(lines.readline())
-    if line["episode_index"] != index:
-        raise ValueError(f"line {index} of {file.name} is of episode {line['episode_index']}")
-    stats: dict[str, Any] = line["stats"]
-    return stats
-
-
-@lru_cache(maxsize=8)
-def _begins(file: Edition) -> list[int]:
-    """Return the offset of each line of a file, in bytes."""
-    with file.path.open("rb") as lines:
-        lengths = [len(line) for line in lines]
-    return [0, *accumulate(lengths)]
-
-
-def sets_v21(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir())
-
-
-def opened_v21(root: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[int, str]]:
-    """Read ``meta/info.json``, each episode's line and provenance by its id, and the tasks by their number."""
-    return _opened_v21(root, max(file.stat().st_mtime_ns for file in (root / "meta").iterdir()))
-
-
-@lru_cache(maxsize=8)
-def _opened_v21(root: Path, modified_ns: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[int, str]]:
-    """Read the result of ``opened_v21``, at a time of the last change."""
-    info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text())
-    rows = read_lines(root / "meta" / "episodes.jsonl")
-    first_step = 0
-    for row in rows:
-        row["first_step"] = first_step
-        first_step += row["length"]
-    provenance = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
-    tasks = {row["task_index"]: row["task"] for row in read_lines(root / "meta" / "tasks.jsonl")}
-    by_id = {}
-    for row, labels in zip(rows, provenance, strict=True):
-        by_id[labels[EPISODE_ID]] = labels | row
-    return info, by_id, tasks
-
-
-def read_lines(file: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in file.read_text().splitlines()]
