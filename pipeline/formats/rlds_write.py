@@ -15,17 +15,8 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import (
-    MATRICES,
-    SCHEMA,
-    STANDARD,
-    Content,
-    MapSpec,
-    MatrixSpec,
-    VectorSpec,
-    check,
-    labels_of,
-)
+from pipeline.episode_check import check
+from pipeline.episode_schema import MATRICES, SCHEMA, STANDARD, Content, MapSpec, MatrixSpec, VectorSpec, labels_of
 from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, list_rewrites
 from pipeline.catalogue.scene_files import portable
-from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, label_faults, labels_of
+from pipeline.episode_check import label_faults
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, labels_of
 from pipeline.formats.annotations import event_annotations, persistent_annotations
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_depth, wrong_numbers, wrong_pixels, wrong_sample

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 from synthetic import IDS, episode, files, with_extras, write_lerobot, write_rlds
 
-from pipeline.episode_schema import MOTION, SCHEMA, check
+from pipeline.episode_check import check
+from pipeline.episode_schema import MOTION, SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.types import Episode, Jpeg
 

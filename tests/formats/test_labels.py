@@ -20,7 +20,8 @@ from synthetic import (
     write_rlds,
 )
 
-from pipeline.episode_schema import check, labels_of
+from pipeline.episode_check import check
+from pipeline.episode_schema import labels_of
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Format
 from pipeline.formats.read_back import Copy, Fault

@@ -9,7 +9,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import SCHEMA, Content, check, labels_of
+from pipeline.episode_check import check
+from pipeline.episode_schema import SCHEMA, Content, labels_of
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.hdf5 import layout

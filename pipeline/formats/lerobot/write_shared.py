@@ -18,7 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, Content, check
+from pipeline.episode_check import check
+from pipeline.episode_schema import ALL_VIEWS, MATRICES, SCHEMA, Content
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, listed, of_levels, open_is_one
