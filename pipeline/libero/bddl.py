@@ -97,7 +97,7 @@ class Bddl:
         return names
 
     @property
-    def asked(self) -> Hashable:
+    def asked(self) -> tuple[Hashable, frozenset[tuple[str, ...]]]:
         """The goal in its scene; equal for two tasks if one goal is to be reached in one scene."""
         facts = set()
         for predicate, *arguments in self.goal:
