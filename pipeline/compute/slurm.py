@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from math import ceil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.compute.workers import VARIABLES
@@ -120,14 +121,34 @@ def slurm_jobs(compute_config: ComputeConfig, folder: Path) -> Iterator[SlurmJob
     Raises:
         PipelineError: if SLURM rejects the job.
     """
+    logs = (folder / LOGS).absolute()
+    workers = compute_config.workers or 1
+    with _cluster(compute_config, logs) as cluster:
+        _try(cluster.job_script())
+        cluster.scale(workers)
+        print(f"{workers} jobs wait in SLURM's queue; their output is in {logs}", file=sys.stderr)
+        yield SlurmJobs(cluster, workers, logs)
+
+
+def check_job(compute_config: ComputeConfig) -> None:
+    """Ask SLURM to check the job of a worker, without submitting it.
+
+    Raises:
+        PipelineError: if SLURM rejects the job, or is not installed.
+    """
+    with TemporaryDirectory() as folder, _cluster(compute_config, Path(folder)) as cluster:
+        _try(cluster.job_script())
+
+
+def _cluster(compute_config: ComputeConfig, logs: Path) -> Any:
+    """Return a ``SLURMCluster`` without jobs, a context in which its scheduler runs."""
     from dask_jobqueue.slurm import SLURMCluster
 
-    job, workers = compute_config.slurm or SlurmConfig(), compute_config.workers or 1
-    logs = (folder / LOGS).absolute()
+    job = compute_config.slurm or SlurmConfig()
     logs.mkdir(parents=True, exist_ok=True)
     # A site may keep the environment of the submitting process from its jobs.
     environment = f"export {in_shell(MACHINE_CODE_VARIABLES | VARIABLES | {'LP_NUM_THREADS': '1'})}"
-    cluster = SLURMCluster(
+    return SLURMCluster(
         cores=1,
         processes=1,
         memory=f"{JOB_GB}GB",
@@ -142,11 +163,6 @@ def slurm_jobs(compute_config: ComputeConfig, folder: Path) -> Iterator[SlurmJob
         worker_extra_args=[*_of_site("worker-extra-args", "extra"), "--memory-limit", "0"],
         scheduler_options={"dashboard_address": "127.0.0.1:0", **_scheduler_of_site()},
     )
-    with cluster:
-        _try(cluster.job_script())
-        cluster.scale(workers)
-        print(f"{workers} jobs wait in SLURM's queue; their output is in {logs}", file=sys.stderr)
-        yield SlurmJobs(cluster, workers, logs)
 
 
 def _of_site(name: str, former_name: str) -> list[str]:

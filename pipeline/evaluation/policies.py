@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -369,7 +370,8 @@ class Checkpoint:
         folder: folder with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
 
     Raises:
-        PipelineError: if the policy wants an image that the tasks do not have, or if its weights were not loaded.
+        PipelineError: if the policy wants an image that the tasks do not have, if its weights were not loaded, or if
+            its packages are missing.
     """
 
     wanted = Wanted()
@@ -386,7 +388,20 @@ class Checkpoint:
         if config.device is None or (config.device.startswith("cuda") and not torch.cuda.is_available()):
             config.device = "cpu"
         weights = _weights_of(folder)
-        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        try:
+            self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        except (ImportError, TypeError) as error:
+            # lerobot's policies replace the names of a missing package by None, which then cannot be called.
+            if isinstance(error, TypeError) and find_spec("transformers"):
+                raise
+            raise PipelineError(
+                f"lerobot cannot load a policy of the type {config.type}: {error}",
+                where=folder,
+                expected=f"the packages that lerobot's {config.type} needs, such as transformers",
+                remedy="install these packages here, or serve the policy from the environment that trained it: "
+                f"`python -m vla_eval.model_servers.lerobot --args.policy_type {config.type} --args.checkpoint "
+                f"{folder}`, then `evaluate --server`",
+            ) from error
         _reject_other_weights(self._policy.state_dict(), weights)
         self._policy.eval()
         self._before, self._after = make_pre_post_processors(

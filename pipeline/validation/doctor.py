@@ -22,6 +22,7 @@ from rich.text import Text
 from pipeline import gl, origins
 from pipeline.axes.language_lint import too_long
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
+from pipeline.compute import slurm
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
@@ -82,6 +83,7 @@ def check(run: Run, need_gb: float) -> list[Diagnosis]:
         *_further_sources(),
         _disk(run, need_gb),
         _machine(run.config.compute),
+        *_slurm(run.config.compute),
     ]
 
 
@@ -279,8 +281,12 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     without = [name for name, count in counts.items() if not count]
     if without:
         none = f"{len(without)} of {len(counts)} tasks have no demonstration under {root}, such as {without[0]}"
-        remedy = "set demos.root to the folder of the suites, and demos.tasks to the tasks that it has"
-        return Diagnosis("demos", "fail", none, f"get <suite>/<task>_demo.hdf5 of these tasks; or {remedy}")
+        remedy = (
+            f"download LIBERO's with `python -m pipeline demos fetch {root} SUITE`, or generate some with "
+            f"`python -m pipeline demos expand {root} --per-task 50`; or set demos.root and demos.tasks to your "
+            "folder and its tasks"
+        )
+        return Diagnosis("demos", "fail", none, remedy)
     detail = f"{sum(counts.values())} demonstrations of {len(counts)} tasks under {root}"
     few = [name for name, count in counts.items() if count < (demos.per_task or 1)]
     if few:
@@ -346,10 +352,24 @@ def _machine(compute: ComputeConfig) -> Diagnosis:
     from distributed.system import MEMORY_LIMIT
 
     # A loop, or a cluster elsewhere, starts no worker processes on this machine.
-    processes = (compute.workers or CPU_COUNT) if compute.cluster == "local" else 1
+    is_local = compute.cluster == "local"
+    processes = (compute.workers or CPU_COUNT) if is_local else 1
     memory_gb = MEMORY_LIMIT / 1e9
-    detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB for {processes} workers"
+    users = f"{processes} workers" if is_local else "this process"
+    detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB for {users}"
     if memory_gb < processes * WORKER_GB:
         remedy = f"set compute.workers to {max(1, int(memory_gb / WORKER_GB))}"
         return Diagnosis("machine", "warn", f"{detail}: less than {WORKER_GB:g} GB each", remedy)
     return Diagnosis("machine", "ok", detail)
+
+
+def _slurm(compute: ComputeConfig) -> Iterator[Diagnosis]:
+    """Let SLURM check the job of a worker, for a configuration with such jobs."""
+    if compute.cluster != "slurm":
+        return
+    try:
+        slurm.check_job(compute)
+    except PipelineError as error:
+        yield Diagnosis("SLURM", "fail", error.what, error.remedy or "")
+    else:
+        yield Diagnosis("SLURM", "ok", f"accepts the jobs, one for each of {compute.workers or 1} workers")

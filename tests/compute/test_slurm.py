@@ -19,8 +19,11 @@ from pydantic import ValidationError
 
 from pipeline.compute.pool import runner
 from pipeline.compute_config import JOB_GB, ComputeConfig, SlurmConfig
+from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.machine_code import machine_code
+from pipeline.run.run import Run
+from pipeline.validation import doctor
 
 DEADLINE_S = 60.0
 
@@ -115,6 +118,19 @@ def test_rejections_by_slurm_are_reported_in_its_words(slurm: Path, tmp_path: Pa
     with pytest.raises(PipelineError, match="invalid partition") as caught, runner(compute, tmp_path / "data") as work:
         work(job_of, [0], "none")
     assert "compute.slurm" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_doctor_lets_slurm_check_the_job_and_submits_none(slurm: Path, tmp_path: Path) -> None:
+    starter = load(REPOSITORY / "configs" / "starter.yaml")
+    results = {}
+    for partition in ("cpu", "nowhere"):
+        compute = ComputeConfig(cluster="slurm", workers=2, slurm=SlurmConfig(partition=partition, memory_gb=1))
+        config = starter.model_copy(update={"compute": compute, "folder": tmp_path})
+        results[partition] = {finding.name: finding for finding in doctor.check(Run(config), 0.001)}["SLURM"]
+    assert [results["cpu"].status, results["nowhere"].status] == ["ok", "fail"]
+    assert "invalid partition" in results["nowhere"].detail
+    assert asked("squeue", "-h", "--states=all") == ""
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,20 @@ def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_rejected(
     monkeypatch.setattr(ACTPolicy, "from_pretrained", classmethod(lambda kind, _, config: kind(config)))
     with pytest.raises(PipelineError, match=r"model\.safetensors: lerobot did not load the weights \(model\."):
         Checkpoint(folder)
+
+
+@pytest.mark.parametrize("config", [SmolVLAConfig, PI05Config])
+def test_a_checkpoint_whose_packages_are_missing_is_named_with_the_server_that_has_them(
+    config: type[SmolVLAConfig | PI05Config], tmp_path: Path
+) -> None:
+    """The project installs lerobot without transformers, which both policies need."""
+    assert find_spec("transformers") is None
+    kind = config(input_features=images(image=32, image2=32), device="cpu")
+    kind._save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").touch()
+    with pytest.raises(PipelineError, match=f"cannot load a policy of the type {kind.type}") as found:
+        Checkpoint(tmp_path)
+    assert f"vla_eval.model_servers.lerobot --args.policy_type {kind.type} --args.checkpoint" in str(found.value)
 
 
 @pytest.mark.parametrize(("least", "warnings"), [(-1.0, 0), (0.0, 1)])
