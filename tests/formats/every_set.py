@@ -102,7 +102,11 @@ def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
     assert dataset.num_frames == sum(len(episode(episode_id)) for episode_id in IDS)
     start = 0
     for index, source in enumerate(map(episode, IDS)):
-        assert dataset.meta.episodes[index]["length"] == len(source)
+        row = dataset.meta.episodes[index]
+        assert row["length"] == len(source)
+        # lerobot 0.6.1 selects by these in its ``episode_filter``.
+        for name in ("episode_id", "suite", "axis", "component", "level"):
+            assert row[name] == source.provenance[name]
         items = [dataset[t] for t in range(start, start + len(source))]
         start += len(source)
         assert {int(item["episode_index"]) for item in items} == {index}

@@ -149,6 +149,14 @@ def test_changed_statistics_of_an_episode_of_version_3_are_found(column: str, wr
     assert any(text.startswith(f"{figure} of {name} is") for text in texts)
 
 
+@pytest.mark.parametrize("column", ["episode_id", "suite", "axis", "component", "level"])
+def test_a_changed_label_by_which_users_select_is_found(column: str, written: Path, tmp_path: Path) -> None:
+    target = opened("lerobot", written, tmp_path)
+    spoil_table(min((target.root / "meta" / "episodes").rglob("*.parquet")), column, another)
+    texts = found(target, tmp_path)
+    assert any(text.startswith(f"meta/episodes, {IDS[0]}: {column} is") for text in texts), texts
+
+
 @pytest.mark.parametrize("file", ["stats.json", "episodes_stats.jsonl"])
 @pytest.mark.parametrize("change", [tenth, brighter])
 @pytest.mark.parametrize("figure", ["std", "mean", "max"])

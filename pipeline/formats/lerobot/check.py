@@ -13,6 +13,7 @@ import datasets
 import huggingface_hub
 import huggingface_hub.constants
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
 
@@ -25,6 +26,7 @@ from pipeline.formats.lerobot.columns import (
     FILE_MB,
     FILES_OF_A_CHUNK,
     PLACE,
+    SELECTED_BY,
     VIDEO_PATH,
     Layout,
 )
@@ -128,6 +130,7 @@ def _format(root: Path, episodes: Mapping[str, Mapping[str, Any]], layout: Layou
     yield from wrong_tasks("lerobot", tasks, [row["tasks"][0] for row in episodes.values()])
     yield from _wrong_splits(info["splits"], len(episodes), val)
     yield from _wrong_files(root, episodes, layout)
+    yield from _wrong_selection(root)
     for file in sorted(root.glob("videos/**/*.mp4")):
         yield from wrong_video("lerobot", file, info["features"][file.parent.parent.name]["info"])
 
@@ -178,6 +181,14 @@ def _wrong_files(root: Path, episodes: Mapping[str, Mapping[str, Any]], layout: 
             if file.is_file():
                 existing.add(file.relative_to(root).as_posix())
     yield from unlike("lerobot", {"files": sorted(existing)}, {"files": sorted(wanted)})
+
+
+def _wrong_selection(root: Path) -> Iterator[Fault]:
+    """Compare the columns of ``meta/episodes`` by which users select with ``meta/provenance.parquet``."""
+    provenance = pq.read_table(root / "meta" / "provenance.parquet", columns=list(SELECTED_BY)).to_pylist()
+    tables = [pq.read_table(file, columns=list(SELECTED_BY)) for file in episode_files(root)]
+    for row, wanted in zip(pa.concat_tables(tables).to_pylist(), provenance, strict=True):
+        yield from unlike("lerobot", row, wanted, f"meta/episodes, {wanted[EPISODE_ID]}: ")
 
 
 def _wrong_statistics(root: Path, layout: Layout) -> Iterator[tuple[str, str]]:

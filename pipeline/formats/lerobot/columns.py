@@ -25,6 +25,10 @@ EPISODE_ID = "episode_id"
 """A column of every frame, by which an episode is still found in the manifest after an edit. lerobot's tools to delete,
 split and merge number episodes again and do not keep ``meta/provenance.parquet``."""
 
+SELECTED_BY = (EPISODE_ID, "suite", "axis", "component", "level")
+"""Provenance that ``meta/episodes`` repeats. lerobot's ``episode_filter`` (0.6.1) selects episodes by the columns of
+this table."""
+
 INSTANCES, OBJECT_POSES = "instances", "object_poses"
 """Columns of extras: a JSON list of names in ``meta/provenance.parquet``, and the poses of the named objects in every
 frame."""

@@ -25,6 +25,7 @@ from pipeline.formats.lerobot.columns import (
     FILE_MB,
     FILES_OF_A_CHUNK,
     PLACE,
+    SELECTED_BY,
     VIDEO_PATH,
     Layout,
 )
@@ -165,6 +166,7 @@ def _episode_row(
         "meta/episodes/chunk_index": chunk,
         "meta/episodes/file_index": file,
     }
+    row |= {name: episode.provenance[name] for name in SELECTED_BY}
     row |= labels_of(episode)
     before = first_step - piece.first_step
     for key in video_columns:
