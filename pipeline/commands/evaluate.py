@@ -96,10 +96,11 @@ def evaluate(
 ) -> None:
     """Run a policy on LIBERO's tasks or your own, on LIBERO-Plus's test tasks or on held-out perturbations.
 
-    The command writes a file for each episode into DIR, and summary.json with success rates and their 95 % intervals.
-    The policy is a model server of vla-eval, which you start first, or a checkpoint of lerobot. A stopped evaluation
-    resumes when the command is called again. For test tasks of LIBERO-Plus, the command prints the paper's table of all
-    results in DIR, and writes it into DIR as paper_table.md, .csv and .tex. The last line of the output is JSON.
+    The command writes a file for each episode into DIR, summary.json with success rates and their 95 % intervals, and
+    episodes.csv with the success of each episode. The policy is a model server of vla-eval, which you start first, or a
+    checkpoint of lerobot. A stopped evaluation resumes when the command is called again. For test tasks of LIBERO-Plus,
+    the command prints the paper's table of all results in DIR, and writes it into DIR as paper_table.md, .csv and .tex.
+    The last line of the output is JSON.
     """
     policies = {"server": server, "checkpoint": checkpoint, "replay": replay}
     chosen = [name for name, value in policies.items() if value is not None]

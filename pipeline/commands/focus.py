@@ -1,7 +1,6 @@
 """Command ``focus``, which prints one line of JSON last."""
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -60,4 +59,5 @@ def focus(results: tuple[Path, ...], source: Path, out: Path, episodes: int | No
     print("\n".join("  ".join(row).rstrip() for row in focusing.table(focused.reasons)))
     counted = ", ".join(f"{policy} ({number})" for policy, number in focused.policies.items())
     print(f"counted episodes: {counted}; left out, of other tasks, axes or levels: {focused.left_out}")
-    print(json.dumps({"file": str(out), **asdict(focused), "reasons": [row._asdict() for row in focused.reasons]}))
+    # The reasons are in the table above, and in the file.
+    print(json.dumps({"file": str(out), **{name: value for name, value in vars(focused).items() if name != "reasons"}}))

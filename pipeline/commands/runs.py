@@ -86,7 +86,8 @@ def _parts() -> Iterable[str]:
     multiple=True,
     type=OneOf(_parts),
     metavar="PART",
-    help="Part to delete, such as pictures, frames or trajectories; may be given several times (default: all parts).",
+    help="Part to delete: unfinished, pictures, uploads, rlds, lerobot, hdf5, frames, trajectories or tables; may be "
+    "given several times (default: all parts).",
 )
 @click.option("--yes", is_flag=True, help="Delete without a question.")
 def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:

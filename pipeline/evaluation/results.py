@@ -1,5 +1,7 @@
 """Results of an evaluation: one file per episode, and the results of several folders."""
 
+import csv
+import io
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -27,6 +29,22 @@ PER_TASK = ("draws", "files of the benchmark", "definition of the task", "demons
 
 RECORDED = ("pipeline", "vla-eval")
 """Versions of a result that do not decide whether the result is up to date."""
+
+TABLE = (
+    "source",
+    "suite",
+    "name",
+    "axis",
+    "component",
+    "level",
+    "number",
+    "success",
+    "reason",
+    "steps",
+    "seed",
+    "episode",
+)
+"""Columns of ``episodes.csv``."""
 
 Trial = tuple[EvaluationTask, int, str]
 """Task, seed and perturbations. Results of two policies can be compared one by one if their trials are equal."""
@@ -95,6 +113,19 @@ class EpisodeFiles:
         """Return the path of an episode's video."""
         return self.folder / "videos" / f"{episode}.mp4"
 
+    @property
+    def table(self) -> Path:
+        """Return the path of the table of the episodes."""
+        return self.folder / "episodes.csv"
+
+    def write_table(self, rows: Iterable[EpisodeResult]) -> None:
+        """Write a line for each episode, with the columns ``TABLE``."""
+        lines = io.StringIO()
+        writer = csv.writer(lines, lineterminator="\n")
+        writer.writerow(TABLE)
+        writer.writerows([getattr(row, column) for column in TABLE] for row in rows)
+        write(self.table, lines.getvalue())
+
     def reject_other_folder(self) -> None:
         """Reject a folder with files but without results, such as a checkpoint's, and another program's summary.
 
@@ -102,11 +133,12 @@ class EpisodeFiles:
             PipelineError: if the folder is rejected; it names the folder or the file.
         """
         reject_other_file(self.folder / "summary.json", '"by_axis": ')
+        reject_other_file(self.table, ",".join(TABLE))
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
         # Workers of a cluster write log files into the folder. An evaluation without results writes its summary.
         names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
-        if set(names) - {"summary.json", LOGS.parts[0]}:
+        if set(names) - {"summary.json", self.table.name, LOGS.parts[0]}:
             raise PipelineError(
                 f"the folder has files but no results of an evaluation: {', '.join(sorted(names)[:3])}",
                 where=self.folder,

@@ -58,13 +58,13 @@ class Selection(Frozen, use_attribute_docstrings=True):
     file: Path | None = None
     """list of tasks that ``analyze construct`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES
-    """only these suites; suites of the user's own tasks must be named"""
+    """only these suites, such as libero_goal; suites of the user's own tasks must be named"""
     axes: tuple[str, ...] = ()
-    """only these axes"""
+    """only these axes, which ``python -m pipeline axes`` lists"""
     components: tuple[ComponentName, ...] = ()
-    """only these components"""
+    """only these components, the kinds of an axis in the same list"""
     levels: tuple[int, ...] = ()
-    """only these levels"""
+    """only these levels, 1 to 5"""
     tasks: tuple[str, ...] = ()
     """shell-style patterns, one of which must match the name of the task or of its LIBERO task, or suite/name"""
     episodes: int = Field(default=1, ge=1)

@@ -53,6 +53,7 @@ CASES = (
     ("results/gap.json", b'{"gap": 1}', ("analyze", "gap", "results")),
     ("bank.yaml", b"mine: true\n", (*REWRITE, "--out", "bank.yaml")),
     ("policy/summary.json", b"{}", ("evaluate", "policy", "--replay", "--task", STOVE.name, "--workers", "1")),
+    ("policy/episodes.csv", b"mine\n1\n", ("evaluate", "policy", "--replay", "--task", STOVE.name, "--workers", "1")),
     ("policy/config.json", b"{}", ("evaluate", "policy", "--replay", "--task", STOVE.name, "--workers", "1")),
 )
 

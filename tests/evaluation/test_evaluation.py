@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import av
 import numpy as np
+import pandas as pd
 import pytest
 from conftest import REPOSITORY, STOVE
 from episode_results import result
@@ -276,6 +277,11 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path, e
     assert rows(alone) == rows(begun)
     found = json.loads((begun / "summary.json").read_text())
     assert found["all"]["successes"] == found["all"]["episodes"] == 2
+    table = pd.read_csv(begun / "episodes.csv", index_col="episode")
+    assert {*table.index} == rows(begun).keys()
+    for episode, row in rows(begun).items():
+        columns = ("source", "suite", "name", "axis", "level", "number", "success", "reason", "steps")
+        assert {column: table.loc[episode, column] for column in columns} == {column: row[column] for column in columns}
 
 
 @pytest.mark.slow
