@@ -96,8 +96,8 @@ class PlanConfig(Frozen):
         seed: Key of every random value of the run.
         axes: Ranges of each axis; default ranges for an axis of ``episodes`` that is not listed.
         episodes: Number of kept episodes to generate of each axis, spread over the tasks evenly or by
-            ``task_weights``; empty for clean twins alone. Axes joined by ``+`` in any order, such as ``camera+light+language``, perturb the same
-            episode.
+            ``task_weights``; empty for clean twins alone. Axes joined by ``+`` in any order, such as
+            ``camera+light+language``, perturb the same episode.
         reserve: Share of additional candidates of each task, 0 to 10, rounded up; 0.5 by default. A failed episode is
             replaced by the reserve with the nearest level, then the same component.
         task_weights: Weight of ``<suite>/<task>`` in the distribution of episodes over the tasks; 1 by default.

@@ -47,6 +47,9 @@ RECIPES: dict[Step, int] = {
 MAPS_RECIPE = 2
 """Recipe of depth, segmentation and boxes; only the files of runs with these extras depend on it."""
 
+OTHER_SIZE_RECIPE = 1
+"""Recipe of noise in frames of another size than LIBERO's; only the files of runs with such frames depend on it."""
+
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),
     "encoding": ("physics", "pixels"),

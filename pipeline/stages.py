@@ -13,10 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from pipeline import gl
-from pipeline.axes import AXES
-from pipeline.axes.base import Layer
 from pipeline.clients.files import RECIPE
-from pipeline.episode_schema import SIZE_PX
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import FAILURES
 from pipeline.files import read_json, write, write_json
@@ -141,11 +138,6 @@ def check_leakage(run: Run) -> None:
     On an axis that is configured to keep no clearance, overlaps are only reported.
     """
     findings = leakage.check(run.plan, benchmark.load())
-    size_px = run.config.render.size_px
-    if size_px != SIZE_PX:
-        for name in findings:
-            if AXES[name].kinds[0].layer is Layer.PIXELS:
-                print(f"{name}: levels and distances are those of frames of {SIZE_PX} pixels, not of {size_px}")
     leakage.write(findings, run.path(LEAKAGE))
     Console().print(leakage.report(findings))
     for name, axis in run.config.plan.axes.configured().items():

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from enum import IntEnum
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
@@ -436,9 +437,13 @@ Number = TypeVar("Number", bound=float)
 
 
 def _ordered(intervals: tuple[tuple[Number, Number], ...]) -> tuple[tuple[Number, Number], ...]:
-    """Check that there are intervals and that each has ``low <= high``."""
+    """Check that there are intervals, that each has ``low <= high``, and that no two overlap."""
+    given = [list(interval) for interval in intervals]
     if not intervals or any(low > high for low, high in intervals):
-        raise ValueError(f"expected one or more [low, high] with low <= high, got {[list(i) for i in intervals]}")
+        raise ValueError(f"expected one or more [low, high] with low <= high, got {given}")
+    for (_, end), (begin, _) in pairwise(sorted(intervals)):
+        if begin < end:
+            raise ValueError(f"expected intervals that do not overlap, got {given}")
     return intervals
 
 

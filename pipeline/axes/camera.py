@@ -249,9 +249,10 @@ class AsideRange(Frozen):
 
     Attributes:
         elevation_deg: Intervals of the elevation in degrees; by default on both sides of the test set's elevations, 0
-            and 15 degrees.
+            and 15 degrees. Values outside of the component's own ranges are never used: by default, those below 0.
         distance_scale: Intervals of the multiple of the distance; by default on both sides of the nominal distance,
-            which most test cameras keep. A camera that still comes too close to a test camera is sampled again.
+            which most test cameras keep. A camera that still comes too close to a test camera is sampled again. Values
+            outside of the component's own ranges are never used: by default, those below 1.
         turn_deg: Intervals of the turn in place in degrees, in any direction. A camera that moved around the scene only
             turns by a yaw, as its pitch would roll it like no test camera.
     """
@@ -279,7 +280,10 @@ ASIDES: dict[Component, tuple[Aside, ...]] = {
     "spherical": ("elevation", "distance", "yaw"),
     "orientation": ("elevation", "distance"),
 }
-"""Kinds of second change of each component's perturbations, each with equal probability."""
+"""Kinds of second change of each component's perturbations, each with equal probability.
+
+A second change that leaves the component's ranges, or a camera that is still too close to a test camera, is sampled
+again. The kinds of the cameras that remain are therefore not equally frequent."""
 
 COMPONENT_OF: dict[Aside, Component] = {
     "elevation": "spherical",

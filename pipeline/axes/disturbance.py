@@ -99,10 +99,10 @@ class DisturbancePerturbation(PhysicsPerturbation):
         return self.first_step + self.steps
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
-        """Measure the distance of the hand from the clean twin's path at the end of the push."""
+        """Measure the distance of the hand from its place in the clean twin, at the end of the push."""
         look, twin = episode.look(self.acts_until), episode.twin_look(self.acts_until)
         if twin is not None:
-            yield f"distance of the hand from its path after a push of level {self.level} (cm)", look.moved_cm(twin)
+            yield f"distance of the hand from the twin's after a push of level {self.level} (cm)", look.moved_cm(twin)
 
 
 class DisturbanceAxis(Axis):

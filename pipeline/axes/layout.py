@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from typing import Annotated, ClassVar, Literal, cast
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +17,7 @@ from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, nouns_of, taken, words_in
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
-from pipeline.libero.arenas import ARENAS, SURFACES, Arena
+from pipeline.libero.arenas import ARENAS, Arena
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, Frozen, RollOut, Scene, Task
@@ -108,12 +108,9 @@ class LayoutPerturbation(PhysicsPerturbation):
 
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Measure the number of added objects and their places."""
-        model, placed = episode.model, episode.resolved["layout"]["objects"]
-        bodies = [model.body(body).name for body in range(model.nbody)]
-        surface_m = model.body(next(name for name in SURFACES if name in bodies)).pos
-        xy_m = np.array([thing["position_m"][:2] for thing in placed]) - surface_m[:2]
         arena = bddl.read(episode.task.bddl_file).arena
-        return _measures([added.name for added in self.objects], xy_m, arena)
+        places_m = _on_surface(episode.resolved["layout"]["objects"], arena)
+        return _measures([added.name for added in self.objects], places_m, arena)
 
 
 class LayoutAxis(Axis):
@@ -186,9 +183,8 @@ class LayoutAxis(Axis):
         tested_at = np.array([place for task in tested for place in _test_places_m(task)])
         placed_at = []
         for item in kept:
-            room = ARENAS[bddl.read(item.task.bddl_file).arena]
             placed = item.resolved["objects"] if item.resolved else ()
-            placed_at += [np.array(thing["position_m"][:2]) - [room.surface_x_m, 0.0] for thing in placed]
+            placed_at += [*_on_surface(placed, bddl.read(item.task.bddl_file).arena)]
         categories: set[str] = set()
         for item in kept:
             categories |= item.perturbation._categories
@@ -211,6 +207,12 @@ def _test_places_m(tested: TestTask) -> Floats:
     """Return the places (N, 2) of the objects that a test task adds, in the frame of the working surface."""
     pairs = str(tested.parameters["positions"]).split(";")
     return np.array([pair.split(",") for pair in pairs if pair], float).reshape(-1, 2)
+
+
+def _on_surface(placed: Sequence[Mapping[str, Any]], arena: Arena) -> Floats:
+    """Return the places (N, 2) of recorded objects in the frame of the working surface."""
+    places_m = np.array([thing["position_m"][:2] for thing in placed], float).reshape(-1, 2)
+    return places_m - [ARENAS[arena].surface_x_m, 0.0]
 
 
 def _measures(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:

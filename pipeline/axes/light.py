@@ -156,7 +156,7 @@ class LightAxis(Axis):
         components: Components to sample; all of them by default. ``shadows`` also turns the lamps. ``combined`` changes
             diffuse light, direction and gloss together, with shadows in half of its perturbations.
         combined_share: Share of the perturbations with the component ``combined``, if ``components`` has it and others;
-            0.6 by default. The other components have equal probability.
+            0.6 by default. Each other entry of ``components`` has equal probability.
         ranges: Ranges of each level, weakest first.
     """
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Annotated, ClassVar, Literal, TypeVar, get_args
 
+import cv2
 import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
@@ -16,6 +17,7 @@ from pipeline.axes.base import LEVELS, Axis, ByLevel, PixelPerturbation, level_f
 from pipeline.axes.component_names import current_names, stored_names
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.axes.report_data import BENCHMARK, CoveragePlots, KeptPerturbation, ObservedEpisode, Strips
+from pipeline.episode_schema import SIZE_PX
 from pipeline.errors import PipelineError
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -58,12 +60,20 @@ class NoisePerturbation(PixelPerturbation):
     def apply(self, frame: Frame, frame_index: int) -> Frame:
         """Return a corrupted copy of one frame.
 
+        Parameters are pixels of a frame of ``SIZE_PX``, as in the benchmark. Frames of another size are resized to it,
+        corrupted, and resized back: they look like corrupted frames of this size that were resized.
+
         Args:
             frame: (H, W, 3) RGB in the raw orientation of the simulator, *before* the rotation by 180 degrees. The
                 benchmark corrupts at this point, and motion, fog and glass are not symmetric under the rotation.
             frame_index: index of the frame in its episode; each index has random numbers of its own.
         """
-        return self.effect.apply(frame, seeding.rng(self.seed, "noise", frame_index))
+        rng = seeding.rng(self.seed, "noise", frame_index)
+        height, width, _ = frame.shape
+        if (height, width) == (SIZE_PX, SIZE_PX):
+            return self.effect.apply(frame, rng)
+        corrupted = self.effect.apply(_resized(frame, SIZE_PX, SIZE_PX), rng)
+        return _resized(corrupted, height, width)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances to the component's test severities of all tasks: 0.5 is half way to the next severity.
@@ -106,6 +116,14 @@ class NoisePerturbation(PixelPerturbation):
         # Beyond the strongest severity the last step is continued.
         upper = min(max(bisect.bisect_left(steps, value), 1), len(tested))
         return upper - (steps[upper] - value) / (steps[upper] - steps[upper - 1])
+
+
+def _resized(frame: Frame, height: int, width: int) -> Frame:
+    """Resize a frame (H, W, 3): smaller by the mean of the covered pixels, larger linearly."""
+    is_smaller = height * width < frame.shape[0] * frame.shape[1]
+    return np.asarray(
+        cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR), np.uint8
+    )
 
 
 @cache

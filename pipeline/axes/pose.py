@@ -369,13 +369,13 @@ class PoseAxis(Axis):
     """Displacements in all directions with equal probability.
 
     The component ``scene`` moves everything at once, as LIBERO-Plus does: see ``sample_scene``. The other components
-    move and turn one object, sampled from the objects of the task that they can move.
+    move and turn one object, sampled with equal probability from the objects of the task that they can move.
 
     Attributes:
         levels: Levels to sample, 1 (weak) to 5 (strong), all five by default. Each entry has equal probability, except
             for scenes with LIBERO-Plus's places, which have level 5.
         components: Components to sample: ``scene`` moves all objects, ``target`` an object that the task moves, and
-            ``receptacle`` an object that receives it; ``scene`` by default.
+            ``receptacle`` an object that receives it. Each entry has equal probability; ``scene`` by default.
         benchmark_places: Share of the goal suite's scenes in which three objects first get LIBERO-Plus's places, up to
             35 cm away; 1 by default. Such a scene has level 5, and occurs only if ``levels`` contains 5.
         step_m: Width of a level's ring in m, not for ``scene``: at level k, an object moves by k - 1 to k times this
@@ -396,10 +396,10 @@ class PoseAxis(Axis):
 
     def applies(self, task: Task) -> bool:
         """Return whether the task has a thing to move: some tasks only open, close or turn things in place."""
-        return bool(self._choices(task))
+        return bool(self._movable(task))
 
-    def _choices(self, task: Task) -> list[tuple[Component, str]]:
-        """List the components with each thing that they can move; the component ``scene`` moves ``all``."""
+    def _movable(self, task: Task) -> dict[Component, tuple[str, ...]]:
+        """Map each configured component that moves a thing of the task to these things; ``scene`` moves ``all``."""
         definition = definition_of(task)
         all_places_known = definition.places and definition.centres_m.keys() == definition.places.keys()
         movable: dict[Component, tuple[str, ...]] = {
@@ -407,10 +407,7 @@ class PoseAxis(Axis):
             "receptacle": definition.receptacles,
             "scene": ("all",) if all_places_known else (),
         }
-        choices: list[tuple[Component, str]] = []
-        for component in self.components:
-            choices += [(component, name) for name in movable[component]]
-        return choices
+        return {component: movable[component] for component in self.components if movable[component]}
 
     @classmethod
     def level_of_test(cls, tested: TestTask) -> int:
@@ -425,7 +422,9 @@ class PoseAxis(Axis):
         return self.benchmark_places == 0 or 5 not in self.levels or not _benchmark_places_m(task)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
-        component, moved = pick(rng, self._choices(task))
+        movable = self._movable(task)
+        component = pick(rng, [component for component in self.components if component in movable])
+        moved = pick(rng, movable[component])
         level = self.sample_level(rng)
         if component == "scene":
             return self._sample_moved_scene(rng, level, task)

@@ -76,8 +76,8 @@ class AxisDistance:
         clearance: least allowed distance, for this episode's kind of perturbation if the axis has several.
         measure: definition and unit of the distance, for each kind of perturbation.
         overlaps: number of episodes that are closer than their clearance.
-        verdict: ``overlap``, ``disjoint``, ``disjoint where compared`` if some episodes were not compared, or
-            ``unknown`` if no episode was compared.
+        verdict: ``overlap``, ``disjoint``, ``disjoint where compared`` if some episodes were not compared,
+            ``unknown`` if no episode was compared, or ``no test tasks`` if the test set has none on the axis.
         coverage: component of the test tasks to their distances from the wanted episodes, without reserves; the report
             has the distances from the kept episodes (``covered_by``).
     """
@@ -181,6 +181,8 @@ def _finding(
     alike = math.isfinite(closest.distance)
     if overlaps:
         verdict = "overlap"
+    elif not test_tasks:
+        verdict = "no test tasks"
     elif not_compared == len(comparisons):
         verdict = "unknown"
     else:

@@ -16,9 +16,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.config import RenderConfig
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, SIZE_PX
 from pipeline.errors import PipelineError
-from pipeline.identity import MAPS_RECIPE
+from pipeline.identity import MAPS_RECIPE, OTHER_SIZE_RECIPE
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import SUFFIX, Store
@@ -73,7 +73,8 @@ class FrameStore(Store):
     def __init__(self, root: Path, render_config: RenderConfig):
         schema = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
         maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS, "boxes"} & {*render_config.extras} else {}
-        super().__init__(root, settings_of(render_config), {"episode schema": schema, **maps})
+        size = {"recipe of the size": OTHER_SIZE_RECIPE} if render_config.size_px != SIZE_PX else {}
+        super().__init__(root, settings_of(render_config), {"episode schema": schema, **maps, **size})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:

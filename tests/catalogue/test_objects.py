@@ -6,6 +6,7 @@ import shutil
 import tarfile
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,11 +21,11 @@ from pipeline.catalogue import object_sources, sweethome3d
 from pipeline.catalogue.meshes import convert
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Package, catalogue
-from pipeline.catalogue.objects import TEST_CATEGORIES, find, goes_with, models, taken
+from pipeline.catalogue.objects import TEST_CATEGORIES, find, goes_with, is_of_test_set, models, taken
 from pipeline.catalogue.sources import Folder
 from pipeline.commands.command_line import run
 from pipeline.errors import PipelineError
-from pipeline.libero.tasks import find_task, tasks
+from pipeline.libero.tasks import find_task, select_tasks, tasks
 from pipeline.seeding import rng
 
 INSTALLED = models(("libero", "robosuite"))
@@ -131,6 +132,32 @@ def test_no_object_is_called_what_the_scene_or_the_instruction_already_names() -
     fitting = {model.category for model in INSTALLED.values() if goes_with(model, there)}
     assert not fitting & {"bowl", "ramekin", "plate", "cookies"}
     assert "basket" in fitting
+
+
+@pytest.mark.parametrize(
+    ("category", "task"),
+    [
+        ("bottle_of_milk", "pick_up_the_milk_and_place_it_in_the_basket"),
+        ("box_of_butter", "pick_up_the_butter_and_place_it_in_the_basket"),
+        ("bottle_of_ketchup", "pick_up_the_ketchup_and_place_it_in_the_basket"),
+    ],
+)
+def test_a_user_s_object_is_not_added_where_the_instruction_asks_for_its_content(category: str, task: str) -> None:
+    """``docs/configuration.md`` recommends such names."""
+    model = replace(models(("libero",))["libero/basket"], category=category)
+    assert not goes_with(model, taken(find_task("libero_object", task)))
+    assert goes_with(model, taken(select_tasks(["libero_10/STUDY*"])[0]))
+
+
+@pytest.mark.parametrize(
+    ("category", "tested"),
+    [
+        *(("can_of_soda", True), ("soda_can", True), ("soda", True), ("barbecue_sauce", True)),
+        *(("bottle", False), ("can_of_beans", False), ("soda_machine", False)),
+    ],
+)
+def test_a_category_of_the_test_set_is_known_by_its_words(category: str, tested: bool) -> None:
+    assert is_of_test_set(category) == tested
 
 
 def test_every_task_leaves_enough_categories_to_choose_from() -> None:

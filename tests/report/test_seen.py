@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -18,6 +19,8 @@ from pipeline.axes.report_data import KeptPerturbation
 from pipeline.config import Config, DemosConfig, PlanConfig, ReplayConfig, load
 from pipeline.export_config import Where
 from pipeline.images.jpeg import encode
+from pipeline.libero import bddl
+from pipeline.libero.arenas import ARENAS
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
@@ -93,6 +96,25 @@ def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
     between_cm = 100 * np.linalg.norm(moves_m[0]["milk_1"] + away - moves_m[1]["milk_1"] - [[0, 0], 2 * away], axis=1)
     nearest_cm = [cm for what, cm in PoseAxis.observe_tests(test) if what.endswith("to its nearest placement (cm)")]
     assert nearest_cm == pytest.approx([between_cm.min(), 0, 2, 0, 2, 0])
+
+
+@pytest.mark.parametrize(
+    "scene", ["libero_goal/put_the_bowl*", "libero_10/KITCHEN*", "libero_10/LIVING*", "libero_10/STUDY*"]
+)
+def test_an_added_object_is_as_far_from_the_camera_as_in_the_world(scene: str) -> None:
+    """LIBERO's cameras are in the world, whose origin is not that of every working surface."""
+    task = select_tasks([scene])[0]
+    room = ARENAS[bddl.read(task.bddl_file).arena]
+    place_m = np.array([room.surface_x_m + 0.1, -0.2])
+    layout = LayoutAxis(levels=(1,)).sample(rng("layout", 1), task, 0)
+    episode: Any = SimpleNamespace(
+        task=task, resolved={"layout": {"objects": [{"position_m": [*place_m, 1.0]}]}}, model=None
+    )
+    shown = dict(layout.observe(episode))
+    assert not shown["objects on the camera's side"]
+    across_m = math.dist(room.camera_m[:2], place_m)
+    expected_m = math.hypot(across_m, room.camera_xz_m[1])
+    assert shown["distance from an added object to the camera (m)"] == pytest.approx(expected_m, abs=0.01)
 
 
 def test_what_a_test_shows_is_measured_in_its_own_scene() -> None:
