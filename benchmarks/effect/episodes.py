@@ -147,7 +147,9 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
             rank = begin + row.rank
             clean.append(replace(row, rank=rank, wanted=rank < experiment.demonstrations))
     chosen = [row for row in rows if row.role == "perturbed"] + clean
-    further = _further(experiment, arm, list(chain.from_iterable(by_task[task] for task in experiment.tasks)))
+    # Replays of a perturbed episode follow the clean twin. Spare demonstrations have one only if they are needed.
+    replayed = [by_task[task][: experiment.demonstrations] for task in experiment.tasks]
+    further = _further(experiment, arm, list(chain.from_iterable(replayed)))
     return rows + clean + further, chosen + further
 
 

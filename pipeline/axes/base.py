@@ -230,6 +230,16 @@ class Axis(Frozen):
         """
         raise NotImplementedError
 
+    def sample_after(
+        self, rng: np.random.Generator, task: Task, place: int, earlier: Sequence[Perturbation]
+    ) -> Perturbation:
+        """Sample one perturbation, as ``sample``, of a demonstration that an expansion generated.
+
+        Args:
+            earlier: changes with which the expansion generated it; empty for other demonstrations.
+        """
+        return self.sample(rng, task, place).after(earlier)
+
     def entries(self, task: Task) -> Sequence[str]:
         """List the entries that the axis takes its perturbations of a task from; empty if it samples from ranges."""
         return ()

@@ -102,7 +102,10 @@ class DisturbancePerturbation(PhysicsPerturbation):
         """Measure the distance of the hand from its place in the clean twin, at the end of the push."""
         look, twin = episode.look(self.acts_until), episode.twin_look(self.acts_until)
         if twin is not None:
-            yield f"distance of the hand from the twin's after a push of level {self.level} (cm)", look.moved_cm(twin)
+            yield (
+                f"distance of the hand from that of the clean twin after a push of level {self.level} (cm)",
+                look.moved_cm(twin),
+            )
 
 
 class DisturbanceAxis(Axis):

@@ -110,10 +110,8 @@ class _PosePerturbation(PhysicsPerturbation):
 
     def after(self, earlier: Sequence[Perturbation]) -> Self:
         """Return this change with the displacements of an ``earlier`` change of the axis as ``source_moves``."""
-        for perturbation in earlier:
-            if isinstance(perturbation, _PosePerturbation):
-                return self.model_copy(update={"source_moves": _moves(perturbation.shifts_in_all)})
-        return self
+        shifts = _shifts_of(earlier)
+        return self.model_copy(update={"source_moves": _moves(shifts)}) if shifts else self
 
     def in_scene(self, task: Task) -> Self:
         """Return this change with the names that things have in all tasks with the initial scene of ``task``."""
@@ -124,6 +122,14 @@ class _PosePerturbation(PhysicsPerturbation):
 def _shifts(moves: Iterable[Move]) -> Shifts:
     """Map the name of each moved thing to its displacement."""
     return {move.name: (move.dx_m, move.dy_m) for move in moves}
+
+
+def _shifts_of(earlier: Sequence[Perturbation]) -> Shifts:
+    """Return the displacements of the change of this axis among ``earlier`` changes; empty without one."""
+    for perturbation in earlier:
+        if isinstance(perturbation, _PosePerturbation):
+            return perturbation.shifts_in_all
+    return {}
 
 
 def _moves(shifts: Shifts) -> tuple[Move, ...]:
@@ -287,15 +293,19 @@ def displacements(parameters: Mapping[str, object]) -> Shifts:
     return {name: (float(dx_m), float(dy_m)) for name, dx_m, dy_m in listed}
 
 
-def sample_scene(rng: np.random.Generator, level: Level, task: Task, places_m: Shifts) -> ScenePerturbation:
+def sample_scene(
+    rng: np.random.Generator, level: Level, task: Task, places_m: Shifts, source_m: Shifts | None = None
+) -> ScenePerturbation:
     """Sample moves uniform over the disks of a level, again if they break the scene that the task's file defines.
 
     The file gives the middle of each thing's region. At the new places the relation that the instruction names must
     hold, and the hand must reach the objects that it has to grasp. No two things may come much closer than before.
 
     Args:
-        places_m: displacements of things before those of the disks.
+        places_m: displacements of things from LIBERO's own places before those of the disks.
+        source_m: displacements of things in the perturbed demonstration from LIBERO's own places.
     """
+    source_m = source_m or {}
     definition = definition_of(task)
     carriers, centres_m = definition.carriers, definition.centres_m
     radius_m = level * _disk_m(task)
@@ -305,8 +315,13 @@ def sample_scene(rng: np.random.Generator, level: Level, task: Task, places_m: S
             reach_m = radius_m * math.sqrt(rng.uniform())
             bearing_rad = rng.uniform(-math.pi, math.pi)
             offset_m = [reach_m * math.cos(bearing_rad), reach_m * math.sin(bearing_rad)]
-            shifts[carrier] = np.round(np.add(places_m.get(carrier, (0.0, 0.0)), offset_m), 4)
-        xy_m = {thing: np.add(centres_m[thing], shifts[carrier]) for thing, carrier in carriers.items()}
+            place_m: ArrayLike = (0.0, 0.0)
+            if carrier in places_m:
+                place_m = np.subtract(places_m[carrier], source_m.get(carrier, (0.0, 0.0)))
+            shifts[carrier] = np.round(np.add(place_m, offset_m), 4)
+        xy_m = {}
+        for thing, carrier in carriers.items():
+            xy_m[thing] = centres_m[thing] + np.add(source_m.get(thing, (0.0, 0.0)), shifts[carrier])
         if _fits(task, xy_m):
             break
     moves = []
@@ -422,23 +437,31 @@ class PoseAxis(Axis):
         return self.benchmark_places == 0 or 5 not in self.levels or not _benchmark_places_m(task)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
+        return self.sample_after(rng, task, place, ())
+
+    def sample_after(
+        self, rng: np.random.Generator, task: Task, place: int, earlier: Sequence[Perturbation]
+    ) -> PosePerturbation | ScenePerturbation:
         movable = self._movable(task)
         component = pick(rng, [component for component in self.components if component in movable])
         moved = pick(rng, movable[component])
         level = self.sample_level(rng)
         if component == "scene":
-            return self._sample_moved_scene(rng, level, task)
+            return self._sample_moved_scene(rng, level, task, _shifts_of(earlier)).after(earlier)
         dx_m, dy_m = sample_point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
         turn_deg = round(rng.uniform(-self.turn_deg, self.turn_deg), 2)
-        return PosePerturbation(level=level, component=component, moved=moved, dx_m=dx_m, dy_m=dy_m, dyaw_deg=turn_deg)
+        move = PosePerturbation(level=level, component=component, moved=moved, dx_m=dx_m, dy_m=dy_m, dyaw_deg=turn_deg)
+        return move.after(earlier)
 
-    def _sample_moved_scene(self, rng: np.random.Generator, level: Level, task: Task) -> ScenePerturbation:
-        """Sample a scene from LIBERO's own places, or in the goal suite from the benchmark's."""
+    def _sample_moved_scene(
+        self, rng: np.random.Generator, level: Level, task: Task, source_m: Shifts
+    ) -> ScenePerturbation:
+        """Sample a scene from the demonstration's own places, or in the goal suite from the benchmark's."""
         places_m = _benchmark_places_m(task)
         if not places_m or 5 not in self.levels or rng.random() >= self.benchmark_places:
-            return sample_scene(rng, level, task, places_m={})
+            return sample_scene(rng, level, task, {}, source_m)
         disk_level = pick(rng, LEVELS)
-        scene = sample_scene(rng, disk_level, task, places_m)
+        scene = sample_scene(rng, disk_level, task, places_m, source_m)
         return scene.model_copy(update={"level": 5, "disk_level": disk_level})
 
     @classmethod

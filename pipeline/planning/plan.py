@@ -323,7 +323,7 @@ class Sampler:
         for axis in self.axes:
             turn = taken.order(axis.entries(task), digest(self.seed, self.name, *key))
             place = turn[attempt % len(turn)]
-            perturbation = axis.sample(random, task, place).after(earlier)
+            perturbation = axis.sample_after(random, task, place, earlier)
             choices.append(_Choice(axis, task, earlier, place, perturbation))
             task = perturbation.played(task)
             if perturbation.reset_seed is not None:
@@ -370,7 +370,7 @@ class Sampler:
         random = rng(self.seed, self.name, *key)
         axis_at_level = axis.model_copy(update={"levels": (first.level,)})
         for _ in range(_ATTEMPTS):
-            perturbation = axis_at_level.sample(random, task, 0).after(choice.earlier)
+            perturbation = axis_at_level.sample_after(random, task, 0, choice.earlier)
             is_alike = (perturbation.component, perturbation.level) == (first.component, first.level)
             if is_alike and is_clear(perturbation):
                 return perturbation

@@ -273,6 +273,33 @@ def test_a_level_bounds_how_far_things_move_also_in_the_goal_suite() -> None:
     assert all(scene.level == 5 for scene, far in zip(scenes, is_far, strict=True) if far)
 
 
+def sample_second(task: Task, level: Level, earlier: ScenePerturbation) -> list[dict[str, tuple[float, float]]]:
+    """Displacements from LIBERO's places, both moves together, of 60 second moves."""
+    shifts = []
+    for number in range(60):
+        change = PoseAxis(levels=(level,)).sample_after(rng("second", number), task, 0, (earlier,))
+        assert change.source_moves == earlier.moves
+        shifts.append(change.shifts_in_all)
+    return shifts
+
+
+def test_a_second_move_keeps_what_the_hand_must_grasp_in_its_reach() -> None:
+    """It begins where an expansion put the cream cheese: 0.80 m from the robot, which reaches 0.82 m."""
+    task, robot_m = find_task("libero_goal", "put_the_cream_cheese_in_the_bowl"), np.array([-0.66, 0.0])
+    cheese_m = np.array([-0.05, 0.13])  # in LIBERO's file, from the table's centre
+    dx_m, dy_m = (0.8 / math.dist(cheese_m, robot_m) - 1) * (cheese_m - robot_m)
+    moves = (Move(name="cream_cheese_1", dx_m=round(dx_m, 4), dy_m=round(dy_m, 4)),)
+    earlier = ScenePerturbation(level=5, moves=moves)
+    away_m = [math.dist(cheese_m + shifts["cream_cheese_1"], robot_m) for shifts in sample_second(task, 4, earlier)]
+    assert 0.74 < max(away_m) <= 0.8201
+
+
+def test_a_second_move_reaches_the_benchmarks_places() -> None:
+    earlier = ScenePerturbation(level=1, moves=(Move(name=BOWL, dx_m=0.06, dy_m=-0.05),))
+    off_m = [math.dist(shifts[BOWL], BASE_M[BOWL]) for shifts in sample_second(STOVE, 5, earlier)]
+    assert max(off_m) <= 0.1001, "the radius of the largest disk"
+
+
 def test_a_fixture_takes_along_what_stands_on_it(scenes: Scenes) -> None:
     """And everything else goes its own way; what nobody moves stays where it is, bit for bit."""
     scene, demo = scenes(ON_STOVE), starter_demo(ON_STOVE)
