@@ -269,8 +269,17 @@ def list_rewrites(
     rewrites = _find_rewrites(task, classes, levels, bank)
     if rewrites:
         return rewrites
+    of_class = {component: len(texts) for component, texts in _stored(task, bank).items() if texts}
+    if of_class:
+        raise PipelineError(
+            f"task {task} has no rewrites of class {' or '.join(classes)} at level {' or '.join(map(str, levels))}",
+            where="plan.axes.language",
+            expected="classes and levels of its rewrites: "
+            + ", ".join(f"{number} {component}" for component, number in of_class.items()),
+            remedy="add levels or components to plan.axes.language, or add such rewrites to a bank of your own",
+        )
     raise PipelineError(
-        f"task {task} has no rewrites of class {' or '.join(classes)} at level {' or '.join(map(str, levels))}",
+        f"task {task} has no rewrites",
         where=bank or BANK_FILE,
         expected=f"a task of {', '.join(load_bank())}",
         remedy="add rewrites of the task to the bank, or remove language from the configured axes",

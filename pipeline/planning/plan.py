@@ -109,9 +109,9 @@ def _plan_entry(
     demos_of = {task: demos for task, demos in by_task.items() if _all_apply(sampler.axes, task)}
     if not demos_of:
         raise PipelineError(
-            "none of the selected tasks has a thing that these axes can change",
+            "none of the selected tasks has a thing that these axes can change at their levels and components",
             where=f"plan.episodes.{name}",
-            remedy="add tasks to demos.tasks, or remove the entry from plan.episodes",
+            remedy="add tasks to demos.tasks, add levels or components to plan.axes, or remove the entry",
         )
     # Tasks of one suite differ if the benchmark tests some of their scenes only.
     alike = grouped(((task.suite, is_in_tested_scene(task)), task) for task in demos_of)

@@ -175,6 +175,17 @@ def test_unknown_task_is_named_with_the_file_and_a_remedy() -> None:
         sample(juggle, 0)
 
 
+def test_levels_and_classes_without_a_rewrite_are_named_not_the_bank() -> None:
+    """23 of 40 tasks have no rewrite of this class and level, but each has others."""
+    axis = LanguageAxis(components=("reasoning_chain",), levels=(1,))
+    without = [task for task in TASKS if not axis.list_clear_rewrites(task, TestSet(()))]
+    assert len(without) == 23
+    expected = r"plan\.axes\.language: .* of class reasoning_chain at level 1(?s:.*)add levels or components"
+    for task in without:
+        with pytest.raises(PipelineError, match=expected):
+            axis.entries(task)
+
+
 def test_a_rewrite_equal_to_the_instruction_is_rejected() -> None:
     known = TASKS[0]
     wording = sample(known, 0).text
