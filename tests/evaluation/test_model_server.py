@@ -30,6 +30,7 @@ from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
 from pipeline.evaluation.tasks import libero_task
+from pipeline.libero.tasks import STEP_LIMITS
 
 EXAMPLE = REPOSITORY / "examples" / "model_server.py"
 PAGE = (REPOSITORY / "docs" / "model-server.md").read_text()
@@ -135,9 +136,10 @@ def test_the_server_receives_what_the_table_states_and_moves_the_hand_there(serv
 def test_the_commands_of_the_page_evaluate_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As they stand, but with the free port of the test and another folder."""
+    """As they stand, but with the free port of the test, another folder and shorter episodes."""
     (command,) = re.findall(r"^python -m (pipeline evaluate .*)$", PAGE.replace("\\\n", " "), re.MULTILINE)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 45)
     with running(str(EXAMPLE)) as address:
         monkeypatch.setattr(sys, "argv", shlex.split(command.replace("ws://127.0.0.1:8000", address)))
         assert main() in (None, 0)
@@ -145,7 +147,7 @@ def test_the_commands_of_the_page_evaluate_it(
     assert "announces neither" not in told.err
     assert json.loads(told.out.splitlines()[-1])["all"]["episodes"] == 1
     (row,) = EpisodeFiles(tmp_path / "results" / "closed_eyes").rows()
-    assert (row.base, row.reason, row.steps, row.looks) == ("turn_on_the_stove", "step_limit", 300, 30)
+    assert (row.base, row.reason, row.steps, row.looks) == ("turn_on_the_stove", "step_limit", 45, 5)
     assert (row.settings["wrist"], row.settings["state"], row.settings["shortest_rotation"]) == (True, True, False)
 
 
@@ -228,10 +230,12 @@ def test_the_harness_gives_the_angles_that_its_settings_state(state_angle: State
 
 
 @pytest.mark.slow
-def test_an_evaluation_warns_once(serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_evaluation_warns_once(
+    serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 10)
     policy = PolicyConfig(kind="server", address=serve(Asking()), label="silent")
-    settings = EpisodeSettings(initial_states="demonstration")
-    chosen = Selection(suites=("libero_goal",), tasks=("turn_on*", "put_the_bowl_on_the_plate"))
-    evaluation = Evaluation(settings, policy, policy.identity(), tmp_path)
-    assert evaluate(evaluation, chosen, loop)["all"]["successes"] == 2
+    evaluation = Evaluation(EpisodeSettings(), policy, policy.identity(), tmp_path)
+    chosen = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,), episodes=2)
+    assert evaluate(evaluation, chosen, loop)["all"]["episodes"] == 2
     assert sum("announces neither" in record.getMessage() for record in caplog.records) == 1

@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,8 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import tensorflow_datasets as tfds
-import yaml
-from conftest import REPOSITORY, datasets_in, link_testset, tiny_config
+from conftest import datasets_in, link_testset, run_stages, tiny_config
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
@@ -115,17 +113,21 @@ def test_as_many_demonstrations_as_a_rejection_asks_for_are_enough_and_one_fewer
 def test_too_small_a_share_is_rejected_before_any_work(short_demos: Path, tmp_path: Path) -> None:
     """The milk has two demonstrations, the others one. The last share is another than the plan was made with."""
     link_testset(tmp_path)
-    file = tmp_path / "tiny.yaml"
-    for stage, share, rejected in (("plan", 0.25, True), ("plan", 0.26, False), ("render", 0.25, True)):
+
+    def run_stage(stage: str, share: float) -> None:
         fields = tiny_config(short_demos)
         fields["export"]["lerobot"]["validation"] = share
-        file.write_text(yaml.safe_dump(fields))
-        command = [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(file)]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == rejected, done.stderr
-        if rejected:
-            assert "export.lerobot.validation: no task has enough demonstrations for 0.25 of them" in done.stderr
-            assert "3 or more demonstrations of a task" in done.stderr
+        run_stages(tmp_path, fields, [stage])
+
+    too_small = (
+        r"export\.lerobot\.validation: no task has enough demonstrations for 0\.25 of them"
+        r"(?s:.*)3 or more demonstrations of a task"
+    )
+    with pytest.raises(AssertionError, match=too_small):
+        run_stage("plan", 0.25)
+    run_stage("plan", 0.26)
+    with pytest.raises(AssertionError, match=too_small):
+        run_stage("render", 0.25)
 
 
 def test_tfds_finds_both_splits(episodes: Episodes, tmp_path: Path) -> None:

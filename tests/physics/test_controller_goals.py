@@ -1,5 +1,7 @@
 """Absolute actions are the goals that robosuite's own controller gets from the deltas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import STOVE, starter_demo
@@ -9,7 +11,7 @@ from pipeline.axes import PhysicsPerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
 from pipeline.physics.controller_goals import absolute_actions, replayed_grips, without_jumps
-from pipeline.physics.environment import Environment
+from pipeline.physics.environment import shared
 from pipeline.physics.replay import replay
 from pipeline.seeding import rng
 
@@ -25,9 +27,10 @@ def robot_start(component: str) -> PhysicsPerturbation:
 @pytest.mark.parametrize("component", ["", "controller_posture", "initial_joints"])
 def test_goals_are_those_of_robosuites_controller(component: str) -> None:
     """Also where the first actions do not turn the hand, and the controller keeps the posture of a changed reset."""
-    environment = Environment(STOVE)
+    environment, demo = shared(STOVE), starter_demo(STOVE)
+    begun = replace(demo, actions=demo.actions[:60])
     changes = (robot_start(component),) if component else ()
-    trajectory = replay(environment, starter_demo(STOVE), "t", ReplayConfig(mode="open_loop"), changes)
+    trajectory = replay(environment, begun, "t", ReplayConfig(mode="open_loop"), changes)
     # A few steps without a turn, at the beginning and later, as LIBERO's recordings have them.
     actions = trajectory.actions[:40].copy()
     actions[[0, 1, 2, 20, 21], 3:6] = 0.0

@@ -10,6 +10,7 @@ import pytest
 from arenas import TASKS, VIEWS, both_ways
 
 from pipeline import seeding
+from pipeline.episode_schema import ALL_VIEWS
 from pipeline.rendering.opengl import say_once
 from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.renderer import Renderer
@@ -20,6 +21,8 @@ pytestmark = pytest.mark.slow
 Arena = tuple[str, Renderer, SoftwareRenderer, PlainRenderer]
 """Its name, and its scene rendered with savings and plainly."""
 
+CAMERAS = [view.camera for view in ALL_VIEWS.values()]
+
 
 @pytest.fixture(scope="module", params=TASKS)
 def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
@@ -28,15 +31,18 @@ def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
         yield request.param, opened, ours, plain
 
 
-def test_plain_frames_and_surfaces_are_those_of_mujocos_renderer(arena: Arena) -> None:
+def test_frames_and_surfaces_are_those_of_mujocos_renderer(arena: Arena) -> None:
     """``mujoco.Renderer`` has the first row at the top."""
     _, opened, _, plain = arena
     data, option = opened.data, mujoco.MjvOption()
     option.geomgroup[0] = 0
     with mujoco.Renderer(opened.model, 256, 256, max_geom=1000) as theirs:
-        for camera in VIEWS:
+        for camera in CAMERAS:
             theirs.update_scene(data, camera, option)
-            assert np.array_equal(plain.frame(data, camera), theirs.render()[::-1])
+            expected = theirs.render()[::-1]
+            assert np.array_equal(opened.frame(camera), expected), camera
+            assert np.array_equal(plain.frame(data, camera), expected), camera
+        for camera in VIEWS:
             _, number, kind = plain.surfaces(data, camera)
             # robosuite hides sites by a negative opacity; MuJoCo segments all that are not at 0.
             opacity = opened.model.site_rgba[:, 3].copy()

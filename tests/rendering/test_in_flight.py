@@ -56,20 +56,34 @@ def test_more_frames_in_flight_than_buffers_keep_their_order(kind: type[PlainRen
     assert not any(np.array_equal(frame, following) for frame, following in pairwise(expected))
 
 
+MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
+STREAMS = [
+    Stream("image", (MOVED, NoiseAxis().sample(rng("in flight"), MILK, 0))),
+    Stream("wrist_image", (MOVED,)),
+]
+
+
+def steps_by(kind: type[PlainRenderer], trajectory: Trajectory) -> list[list[Frame]]:
+    """Render the frames of ``STREAMS`` by one kind of renderer."""
+    model = compile_model(trajectory.model_xml)
+    with closing(Renderer(model, kind(model))) as renderer:
+        return list(frames_of_steps(renderer, trajectory, STREAMS))
+
+
+@pytest.fixture(scope="module")
+def short(whole: dict[Task, Trajectory]) -> Trajectory:
+    return replace(whole[MILK], actions=whole[MILK].actions[:6])
+
+
+@pytest.fixture(scope="module")
+def plain_steps(short: Trajectory) -> list[list[Frame]]:
+    return steps_by(PlainRenderer, short)
+
+
 @KINDS
 def test_steps_in_flight_are_yielded_in_order_with_the_noise_of_their_step(
-    kind: type[PlainRenderer], whole: dict[Task, Trajectory]
+    kind: type[PlainRenderer], short: Trajectory, plain_steps: list[list[Frame]]
 ) -> None:
-    trajectory = replace(whole[MILK], actions=whole[MILK].actions[:6])
-    moved = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
-    noise = NoiseAxis().sample(rng("in flight"), MILK, 0)
-    streams = [Stream("image", (moved, noise)), Stream("wrist_image", (moved,))]
-
-    def steps_by(renderer_kind: type[PlainRenderer]) -> list[list[Frame]]:
-        model = compile_model(trajectory.model_xml)
-        with closing(Renderer(model, renderer_kind(model))) as renderer:
-            return list(frames_of_steps(renderer, trajectory, streams))
-
-    expected, in_flight = steps_by(PlainRenderer), steps_by(kind)
-    assert len(in_flight) == len(expected) == 6
-    assert all(np.array_equal(*pair) for pair in zip(in_flight, expected, strict=True))
+    in_flight = steps_by(kind, short)
+    assert len(in_flight) == len(plain_steps) == 6
+    assert all(np.array_equal(*pair) for pair in zip(in_flight, plain_steps, strict=True))

@@ -47,7 +47,7 @@ def elsewhere() -> tuple[str, Floats]:
 
 @pytest.mark.slow
 def test_one_context_shows_one_scene_after_the_other_as_contexts_of_their_own() -> None:
-    scenes = {arena: arenas.scene(arena) for arena in TASKS} | {"elsewhere": elsewhere()}
+    scenes = {arena: arenas.scene(arena) for arena in ("tabletop", "kitchen", "floor")} | {"elsewhere": elsewhere()}
     expected = {}
     for name, (model_xml, state) in scenes.items():
         model = mujoco.MjModel.from_xml_string(model_xml)
@@ -57,10 +57,10 @@ def test_one_context_shows_one_scene_after_the_other_as_contexts_of_their_own() 
 
     with closing(LastScene()) as opened:
         first = opened.renderer(scenes["tabletop"][0]).model_renderer
-        for turn, name in enumerate(("tabletop", "elsewhere", "kitchen", "living_room", "floor", "study", "tabletop")):
+        for turn, name in enumerate(("tabletop", "elsewhere", "kitchen", "floor", "tabletop")):
             model_xml, state = scenes[name]
             # A model has its images; of MJCF, those are read that the scene before does not have.
-            renderer = opened.renderer(model_xml if turn % 4 else mujoco.MjModel.from_xml_string(model_xml))
+            renderer = opened.renderer(model_xml if turn % 3 else mujoco.MjModel.from_xml_string(model_xml))
             assert renderer.model_renderer is first
             for view, frame in shown(renderer, state).items():
                 assert np.array_equal(frame, expected[name][view]), (name, view)

@@ -21,6 +21,9 @@ from pipeline.rendering.software.samples import BATCH_FACES, Projection, faces_t
 from pipeline.types import Floats, Frame
 
 SIZE_PX = 64, 48
+VIEW_PX = 32, 24
+"""Width and height of a view in which every face is tried at every sample."""
+
 SAMPLES = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
 
 
@@ -38,7 +41,7 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
     count = 9 * BATCH_FACES - 100
     # Before the camera at a depth of 1 m, where a pixel is a hundredth of a metre wide.
     focal_px = 100.0
-    middles_px = rng.uniform(-3, np.array(SIZE_PX) + 3, (count, 1, 2))
+    middles_px = rng.uniform(-3, np.array(VIEW_PX) + 3, (count, 1, 2))
     corners_px = middles_px + rng.normal(0, size_px, (count, 3, 2))
     # Some have hardly any area, and may turn to the front when their corners are rounded.
     corners_px[::10, 2] = corners_px[::10].mean(axis=1) + rng.normal(0, 1e-3, (len(corners_px[::10]), 2))
@@ -46,7 +49,7 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
     places_m[:, :2] = corners_px.reshape(-1, 2) / focal_px
     numbers = np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)
     faces = Faces(places_m, places_m, None, numbers, places_m, numbers)
-    projection = Projection(np.diag([focal_px, focal_px, 1.0]) @ np.eye(3, 4), 0.1, 10.0, SIZE_PX)
+    projection = Projection(np.diag([focal_px, focal_px, 1.0]) @ np.eye(3, 4), 0.1, 10.0, VIEW_PX)
     found = np.empty(room(count), np.uint32)
     written = faces_that_show(projection, faces, SAMPLES, found)
     listed = found[:written].reshape(-1, 3)
@@ -55,7 +58,7 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
 
     rounded = np.rint(corners_px * 256) / 256
     needed = np.zeros(count, np.bool_)
-    for column, row in np.ndindex(SIZE_PX):
+    for column, row in np.ndindex(VIEW_PX):
         for sample in SAMPLES.astype(float):
             needed |= covers(rounded, np.array([column, row]) + sample)
     # The next test is about what turns around.

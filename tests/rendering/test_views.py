@@ -1,8 +1,9 @@
 """Frames of every size and of LIBERO's further cameras, from the renderer to the datasets."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import arenas
 import mujoco
@@ -11,6 +12,7 @@ import pytest
 import yaml
 from conftest import BOWL, STOVE, link_testset, run_stages, tiny_config
 from libero_environment import OffScreenRenderEnv
+from numpy.typing import NDArray
 
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import ALL_VIEWS, SCHEMA, SIZE_PX
@@ -24,8 +26,8 @@ from pipeline.run.run import Run
 from pipeline.types import Frame, Jpeg, Task, Trajectory
 
 CAMERAS = [view.camera for view in ALL_VIEWS.values()]
-SIZES_PX = {"tabletop": 64, "floor": 130, "kitchen": 384, "living_room": 512, "study": 256}
-"""Size of the frames by arena: the smallest, the largest, and sizes above and below MuJoCo's default buffer."""
+SIZES_PX = (64, 130, 512)
+"""Smallest size, a size that is no multiple of 4, and the largest size, which is above MuJoCo's default buffer."""
 
 STAGES = (
     "inputs",
@@ -43,11 +45,11 @@ STAGES = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arena", SIZES_PX)
-def test_frames_are_those_of_mujocos_renderer(arena: str) -> None:
-    """``mujoco.Renderer`` has the first row at the top."""
-    model_xml, state = arenas.scene(arena)
-    size_px, option = SIZES_PX[arena], mujoco.MjvOption()
+@pytest.mark.parametrize("size_px", SIZES_PX)
+def test_frames_of_every_size_are_those_of_mujocos_renderer(size_px: int) -> None:
+    """``mujoco.Renderer`` has the first row at the top; ``test_arenas.py`` compares 256 pixels in each arena."""
+    model_xml, state = arenas.scene("tabletop")
+    option = mujoco.MjvOption()
     option.geomgroup[0] = 0
     ours: dict[str, Frame] = {}
     with closing(Renderer(model_xml, size_px=size_px)) as renderer:
@@ -86,42 +88,55 @@ def test_frames_equal_liberos_environment(
             assert np.array_equal(ours[camera], theirs[f"{camera}_image"]), f"{camera} at step {step}"
 
 
-def test_one_scene_is_opened_in_several_sizes(whole: dict[Task, Trajectory], opened: LastScene) -> None:
-    trajectory, shapes = whole[STOVE], []
-    for size_px in (64, 256, 64):
-        renderer = opened.renderer(trajectory.model_xml, size_px)
-        renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
-        shapes.append(renderer.frame("agentview").shape)
-        assert renderer.surfaces("birdview").depth_m.shape == (size_px, size_px)
-    assert shapes == [(64, 64, 3), (256, 256, 3), (64, 64, 3)]
+class Measured(NamedTuple):
+    """Measures of a scene in frames of one size: shape of a frame, matrices of each view, and pixels of each thing."""
+
+    shape: tuple[int, ...]
+    matrices: dict[str, tuple[NDArray[Any], NDArray[Any]]]
+    things_px: Mapping[str, int]
 
 
-def test_matrices_scale_with_the_size(whole: dict[Task, Trajectory], opened: LastScene) -> None:
+def measured(opened: LastScene, trajectory: Trajectory, size_px: int) -> Measured:
+    """Measure a trajectory's first state; a renderer of another size opens the scene again."""
+    renderer = opened.renderer(trajectory.model_xml, size_px)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    assert renderer.surfaces("birdview").depth_m.shape == (size_px, size_px)
+    return Measured(
+        renderer.frame("agentview").shape,
+        {view: matrices(renderer, view) for view in ALL_VIEWS},
+        Sight.of(renderer, STOVE, trajectory.states[:1, 1:4]).things_px,
+    )
+
+
+@pytest.fixture(scope="module")
+def by_size_px(whole: dict[Task, Trajectory], opened: LastScene) -> dict[int, Measured]:
+    return {size_px: measured(opened, whole[STOVE], size_px) for size_px in (128, 256, 512)}
+
+
+def test_one_scene_is_opened_in_several_sizes(
+    by_size_px: dict[int, Measured], whole: dict[Task, Trajectory], opened: LastScene
+) -> None:
+    again = measured(opened, whole[STOVE], 128)
+    shapes = [found.shape for found in (*by_size_px.values(), again)]
+    assert shapes == [(128, 128, 3), (256, 256, 3), (512, 512, 3), (128, 128, 3)]
+
+
+def test_matrices_scale_with_the_size(by_size_px: dict[int, Measured]) -> None:
     """A point at (u + 0.5) of 256 pixels is at (u + 0.5) / 2 of 128 pixels: pixel centres have whole numbers."""
-    trajectory = whole[STOVE]
-    found = {}
-    # A renderer of another size opens the scene again.
-    for size_px in (128, 256):
-        renderer = opened.renderer(trajectory.model_xml, size_px)
-        renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
-        found[size_px] = {view: matrices(renderer, view) for view in ALL_VIEWS}
     for view in ALL_VIEWS:
-        (small_intrinsics, small_extrinsics), (intrinsics, extrinsics) = found[128][view], found[256][view]
+        small_intrinsics, small_extrinsics = by_size_px[128].matrices[view]
+        intrinsics, extrinsics = by_size_px[256].matrices[view]
         halved = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]]) @ intrinsics
         np.testing.assert_allclose(small_intrinsics, halved, rtol=1e-6)
         np.testing.assert_array_equal(small_extrinsics, extrinsics)
 
 
-def test_things_count_as_many_pixels_in_every_size(whole: dict[Task, Trajectory], opened: LastScene) -> None:
-    trajectory, counts = whole[STOVE], {}
-    for size_px in (128, 256, 512):
-        renderer = opened.renderer(trajectory.model_xml, size_px)
-        renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
-        counts[size_px] = Sight.of(renderer, STOVE, trajectory.states[:1, 1:4]).things_px
-    for thing, expected_px in counts[256].items():
+def test_things_count_as_many_pixels_in_every_size(by_size_px: dict[int, Measured]) -> None:
+    for thing, expected_px in by_size_px[256].things_px.items():
         assert expected_px > 100, "otherwise this test tells little"
         for size_px in (128, 512):
-            assert counts[size_px][thing] == pytest.approx(expected_px, rel=0.1), f"{thing} in {size_px} px"
+            counted_px = by_size_px[size_px].things_px[thing]
+            assert counted_px == pytest.approx(expected_px, rel=0.1), f"{thing} in {size_px} px"
 
 
 def test_a_missing_camera_is_a_reason(whole: dict[Task, Trajectory], opened: LastScene) -> None:

@@ -265,7 +265,7 @@ def test_evaluate_prints_and_writes_the_table_of_its_folder(
     out = tmp_path / "replay"
     rows: dict[str, list[str]] = {}
     for axis in ("robot", "language"):
-        options = ["--source", "libero_plus", "--axis", axis, "--suite", "libero_goal", "--subset", "2"]
+        options = ["--source", "libero_plus", "--axis", axis, "--suite", "libero_goal", "--subset", "1"]
         assert command(["evaluate", str(out), "--replay", *options, "--workers", "1"]) == 0
         printed = capsys.readouterr().out
         rows = of_markdown(printed)
@@ -273,9 +273,9 @@ def test_evaluate_prints_and_writes_the_table_of_its_folder(
         assert json.loads(printed.splitlines()[-1])["by_axis"].keys() == {axis}
     cells = dict(zip(COLUMNS, rows["replay"], strict=True))
     assert [name for name in COLUMNS if cells[name] != "-"] == ["robot", "language"], "of both calls"
-    assert rows["replay, tasks run"][1:3] == ["2 of 1,550", "2 of 1,537"]
+    assert rows["replay, tasks run"][1:3] == ["1 of 1,550", "1 of 1,537"]
     line = of_csv((out / "paper_table.csv").read_text())["replay"]
-    assert (line["total_tasks_run"], line["step_limits"], line["program"]) == ("4", "goal 2", "evaluate")
+    assert (line["total_tasks_run"], line["step_limits"], line["program"]) == ("2", "goal 2", "evaluate")
     assert of_latex((out / "paper_table.tex").read_text())[0][0] == "replay"
     (out / "paper_table.csv").write_text("a user's own file")
     assert command(["evaluate", str(out), "--replay", *options, "--workers", "1"]) == 1

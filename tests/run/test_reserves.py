@@ -24,6 +24,9 @@ SEED = 2
 LATER = ("render", "exports", "manifest")
 """Stages after ``replay``."""
 
+TRIED = ("configuration.json", "machine.json", ".finished/trial.json", ".finished/speed.json")
+"""Files of a run on a machine that was tried, so that another run needs no trial."""
+
 
 def reserved(demos: Path) -> dict[str, object]:
     """One episode of each, which has a replay of its own, and two in reserve."""
@@ -74,7 +77,7 @@ def test_a_reserve_is_replayed_where_frames_are_rejected_and_a_rerun_changes_not
     clone = tmp_path / "clone"
     fields = reserved(short_demos)
     in_a_clone(fields, clone)
-    for name in ("configuration.json", "machine.json", ".finished/trial.json"):  # The machine was tried for that run.
+    for name in TRIED:
         copy_of(f"data/tiny/{name}", finished.parent.parent, clone)
     run_stages(clone, fields, ["inputs", "doctor", "plan", "leakage", "replay"])
     replayed = set((clone / "data/tiny/trajectories").glob("*.npz"))
