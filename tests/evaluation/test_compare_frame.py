@@ -30,6 +30,7 @@ CHOSEN = (
     "goal: state3",
     "goal: wrist",
     "goal: camera shifted",
+    "spatial: MuJoCo 3.8.1",
 )
 """Cases of ``benchmarks/frame_causes.py`` in the tests; the script runs all of them."""
 
