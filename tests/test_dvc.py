@@ -56,6 +56,10 @@ def test_a_stage_that_writes_names_of_datasets_depends_on_the_options_of_every_f
     assert "export" in sections(name)
 
 
+def test_previews_depend_on_the_views() -> None:
+    assert "render" in sections("summary")
+
+
 def test_a_run_that_goes_on_elsewhere_is_compared_first() -> None:
     assert "host" in sections("doctor")
     assert DATA + "machine.json" in STAGES["plan"]["deps"]
