@@ -82,6 +82,12 @@ def test_distinct_action_sequences_are_counted_by_task(data: Path) -> None:
     assert cells(text, "**all**", "Diversity") == ["7", "3", "6"]
 
 
+def test_tasks_of_equal_names_in_two_suites_are_two(data: Path) -> None:
+    assert "demonstrations of 2 tasks." in written(data, "rlds")
+    write_rows(data, [*ROWS, row("clean") | {"suite": "libero_90", "demo_id": f"libero_90/{MILK.name}/demo_0"}])
+    assert "demonstrations of 3 tasks." in written(data, "rlds")
+
+
 def test_distances_are_those_of_the_episodes_in_the_dataset(data: Path) -> None:
     """The file ``leakage.json`` has the distances of the wanted episodes, and some of them are not in the dataset."""
     near = CameraAxis(levels=(1,)).sample(rng("near"), MILK, 0)
