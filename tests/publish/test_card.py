@@ -22,14 +22,16 @@ from card_of_run import (
     write_rows,
     written,
 )
-from conftest import BOWL, MILK, STOVE
+from conftest import BOWL, MILK, STOVE, run_in
 
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
+from pipeline.formats.hdf5 import Hdf5Config
 from pipeline.formats.lerobot import LeRobotConfig
 from pipeline.formats.rlds import RldsConfig
+from pipeline.publish import card
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
 
@@ -196,6 +198,20 @@ def test_columns_in_addition_to_the_frames_are_described_where_they_are_there(da
     assert "65535 is 6.5535 m or more;\n  a unit is 0.0001 m." in full
     assert "`instances`" in written(data, kind, extras=("segmentation",))
     assert "`instances`" not in written(data, kind, extras=("depth",))
+
+
+@pytest.mark.parametrize(("views", "all_of_them"), [((), "Both"), (("frontview",), "All")])
+def test_frames_that_are_not_turned_are_described_without_a_contradiction(
+    data: Path, views: tuple[str, ...], all_of_them: str
+) -> None:
+    options = OPTIONS.model_copy(update={"hdf5": Hdf5Config(name=NAME)})
+    card.write(run_in(data, export=options, render={"views": views}))
+    text = (data / "card" / "hdf5" / "README.md").read_text()
+    assert f"  {all_of_them} are the simulator's own pictures" in text
+    # LIBERO's raw frame begins with its lowest row: columns run with the camera's x, and rows against its y.
+    assert "fx is positive and fy is negative" in text
+    assert "fx is negative" not in text
+    assert f"  {all_of_them} are rotated by 180 degrees" in (data / "card" / "rlds" / "README.md").read_text()
 
 
 def test_depth_as_video_and_its_readers_are_named(data: Path) -> None:
