@@ -103,5 +103,9 @@ def test_the_stage_of_exports_depends_on_the_inputs_of_each_group() -> None:
     assert sections_of_groups == {section.partition(".")[0] for section in sections("exports")}
 
 
+def test_the_card_is_generated_again_after_every_change_that_it_records() -> None:
+    assert sections("card") == {*inputs.PUBLISHED} == {*stages.STAGES["card"].settings}
+
+
 def test_params_name_the_shipped_default() -> None:
     assert yaml.safe_load((REPOSITORY / "params.yaml").read_text()) == {"run": "starter", "data": "data"}
