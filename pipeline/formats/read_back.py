@@ -1,6 +1,6 @@
 """Records of a dataset that is read back: its copies of episodes, its files, and the faults of both."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,8 @@ class Copy:
         events: lerobot's column of language events, likewise.
         train: True if the episode is in the training split.
         statistics: statistics of the episode; ``None`` where the dataset states none.
-        lossless: True if the frames in ``decoded`` were stored without loss.
+        lossless_frames: function that yields the frames (H, W, 3) of a view at all steps, one at a time, if they are
+            stored without loss; else ``None``. It raises a PipelineError if a frame cannot be read.
         depth_m: (view, step) to the depth (H, W) in m, for ``sampled`` steps, where depth is a video.
     """
 
@@ -80,7 +81,7 @@ class Copy:
     events: Sequence[Sequence[Mapping[str, Any]]] | None = None
     train: bool = True
     statistics: Statistics | None = None
-    lossless: bool = False
+    lossless_frames: Callable[[str], Iterator[Frame]] | None = None
     depth_m: Mapping[tuple[str, int], NDArray[np.float32]] = field(default_factory=dict)
 
     def __len__(self) -> int:

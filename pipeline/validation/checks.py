@@ -13,10 +13,11 @@ from pipeline.axes.language import LanguagePerturbation, list_rewrites
 from pipeline.catalogue.scene_files import portable
 from pipeline.episode_check import label_faults
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, labels_of
+from pipeline.errors import PipelineError
 from pipeline.formats.annotations import event_annotations, persistent_annotations
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_depth, wrong_numbers, wrong_pixels, wrong_sample
-from pipeline.images.jpeg import decode_exactly
+from pipeline.images.jpeg import decode, decode_exactly
 from pipeline.libero.carried import definition_of
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris
 from pipeline.run.manifest import OWN_VERSION
@@ -266,12 +267,22 @@ def jpeg(case: Case) -> Iterator[Fault]:
             if wrong:
                 what = f"{view} differs at {len(wrong)} steps, first at {wrong[0]}"
                 yield case.finding(copy.dataset, what, "the stored JPEG")
-        for (view, step), frame in copy.decoded.items() if copy.lossless else ():
-            stored = case.stored[view].frames.get(step)
-            if stored is not None and not np.array_equal(frame, stored):
-                yield case.finding(
-                    copy.dataset, f"{view} of step {step} has other pixels", "the pixels of the stored JPEG"
-                )
+        if copy.lossless_frames is not None:
+            yield from _pixels(case, copy, copy.lossless_frames)
+
+
+def _pixels(case: Case, copy: Copy, frames_of: Callable[[str], Iterator[Frame]]) -> Iterator[Fault]:
+    """Compare every frame of a copy with the decoded JPEG file of its step."""
+    for view, files in case.made.frames.items():
+        try:
+            pairs = zip(frames_of(view), files, strict=False)
+            wrong = [step for step, (frame, file) in enumerate(pairs) if not np.array_equal(frame, decode(file))]
+        except PipelineError as error:
+            yield case.finding(copy.dataset, f"{view}: {error}", "frames that can be read")
+            continue
+        if wrong:
+            what = f"{view} has other pixels at {len(wrong)} steps, first at {wrong[0]}"
+            yield case.finding(copy.dataset, what, "the pixels of the stored JPEG")
 
 
 def geometry(case: Case) -> Iterator[Fault]:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -161,7 +161,15 @@ def read(root: Path, episode_id: str, content: Content) -> Copy | None:
     if place is None:
         return None
     with _readable(f"{place.file} data/{place.demo}"), hdf5.opened(place.file) as opened:
-        return _copy(opened[f"data/{place.demo}"], content, _split_of(root, place.file) == "train")
+        return _copy(place, opened[f"data/{place.demo}"], content, _split_of(root, place.file) == "train")
+
+
+def _frames(place: Place, view: str) -> Iterator[Frame]:
+    """Yield the frames of a view of an episode, rotated as in an ``Episode``, with one frame at a time in memory."""
+    name = f"data/{place.demo}/{layout.frames_key(view)}"
+    with _readable(f"{place.file} {name}"), hdf5.opened(place.file) as opened:
+        for frame in opened[name]:
+            yield to_policy(frame)
 
 
 @lru_cache(maxsize=1)
@@ -173,7 +181,7 @@ def _places(files: tuple[Edition, ...]) -> dict[str, Place]:
     return places
 
 
-def _copy(group: h5py.Group, content: Content, train: bool) -> Copy:
+def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Copy:
     attributes = dict(group.attrs)
     obs, actions = group["obs"], group["actions"][()]
     state = np.hstack([obs["ee_pos"][()], obs["ee_ori"][()], obs["gripper_states"][()]])
@@ -209,7 +217,7 @@ def _copy(group: h5py.Group, content: Content, train: bool) -> Copy:
         marks={name: group[array][()] for name, array in MARKS.items()},
         place={},
         train=train,
-        lossless=True,
+        lossless_frames=partial(_frames, place),
     )
 
 
