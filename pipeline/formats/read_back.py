@@ -62,6 +62,7 @@ class Copy:
         decoded: (view, step) to the frame, for ``sampled`` steps, where frames are a video.
         marks: further columns of each step, by the dataset's own names, each (T,).
         place: place of the episode, by the format's columns of the manifest.
+        repeated: further name of a column of the provenance, to that column and the value under the further name.
         said: lerobot's column of persistent language, the entries of each step; ``None`` where the dataset has none.
         events: lerobot's column of language events, likewise.
         train: True if the episode is in the training split.
@@ -83,6 +84,7 @@ class Copy:
     statistics: Statistics | None = None
     lossless_frames: Callable[[str], Iterator[Frame]] | None = None
     depth_m: Mapping[tuple[str, int], NDArray[np.float32]] = field(default_factory=dict)
+    repeated: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.episode)

@@ -248,6 +248,9 @@ def provenance(case: Case) -> Iterator[Fault]:
             value, expected = copy.episode.provenance.get(column), case.row[column]
             if value != expected and column != OWN_VERSION:
                 yield case.finding(copy.dataset, f"{column} is {value!r}", repr(expected))
+        for name, (column, value) in copy.repeated.items():
+            if value != case.row[column]:
+                yield case.finding(copy.dataset, f"{name} is {value!r}", f"{case.row[column]!r}, as {column}")
 
 
 def place(case: Case) -> Iterator[Fault]:

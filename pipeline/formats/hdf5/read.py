@@ -16,6 +16,7 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.hdf5 import layout
+from pipeline.formats.hdf5.write import REPEATED
 from pipeline.formats.read_back import Copy, Fault, in_both_splits, sampled, subtasks_of, unlike
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero import hdf5
@@ -125,6 +126,24 @@ def _wrong_file(file: Path, opened: h5py.File, demos: Mapping[str, str], content
         yield from unlike(FORMAT, {"arrays": found}, {"arrays": arrays}, f"{name} {demo}: ")
         if not np.array_equal(group.attrs["init_state"], group["states"][0]):
             yield Fault(FORMAT, demos[demo], "init_state differs from the first state", "the first state")
+        if found == arrays:
+            yield from _wrong_copies(group, demos[demo])
+
+
+SAME_STATE = 1e-9
+"""Largest difference of entries of ``robot_states`` between processors, in m and parts of a quaternion."""
+
+
+def _wrong_copies(group: h5py.Group, episode_id: str) -> Iterator[Fault]:
+    """Compare LIBERO's arrays that repeat the pose of the hand and the fingers with the arrays that ``read`` reads."""
+    obs = group["obs"]
+    position, orientation, fingers = (obs[name][()] for name in ("ee_pos", "ee_ori", "gripper_states"))
+    if not np.array_equal(obs["ee_states"], np.hstack([position, orientation])):
+        yield Fault(FORMAT, episode_id, "obs/ee_states differs from obs/ee_pos and obs/ee_ori", "the same numbers")
+    expected = np.hstack([fingers, position, layout.quaternions(orientation)])
+    if not np.allclose(group["robot_states"], expected, rtol=0, atol=SAME_STATE):
+        what = "robot_states differs from obs/gripper_states, obs/ee_pos and obs/ee_ori"
+        yield Fault(FORMAT, episode_id, what, "the same numbers, the orientation as a quaternion")
 
 
 def _arrays(steps: int, numbers: int, content: Content) -> dict[str, str]:
@@ -218,6 +237,7 @@ def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Cop
         place={},
         train=train,
         lossless_frames=partial(_frames, place),
+        repeated={name: (column, str(attributes[name])) for name, column in REPEATED.items()},
     )
 
 
