@@ -1,5 +1,6 @@
 """Checks of an episode in all places that store it: each is a small function that yields the errors it finds."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_depth, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.images.jpeg import decode, decode_exactly
 from pipeline.libero.carried import definition_of
-from pipeline.libero.tasks import WITHOUT_DEBRIS, debris
+from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, exceeds_step_limit
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.run.manifest import labels_of as labels_of_row
 from pipeline.types import Frame
@@ -251,6 +252,19 @@ def provenance(case: Case) -> Iterator[Fault]:
         for name, (column, value) in copy.repeated.items():
             if value != case.row[column]:
                 yield case.finding(copy.dataset, f"{name} is {value!r}", f"{case.row[column]!r}, as {column}")
+
+
+def results(case: Case) -> Iterator[Fault]:
+    """Compute results that the manifest states again from the actions and the start of the replay."""
+    actions, row = case.trajectory.actions, case.row
+    expected = {
+        "actions_sha256": hashlib.sha256(actions.astype(np.float32).tobytes()).hexdigest(),
+        "resolved": case.trajectory.resolved,
+        "exceeds_step_limit": exceeds_step_limit(row["suite"], len(actions)),
+    }
+    for column, value in expected.items():
+        if row[column] != value:
+            yield case.finding("manifest", f"{column} is {row[column]!r}", repr(value))
 
 
 def place(case: Case) -> Iterator[Fault]:
@@ -507,7 +521,7 @@ def _listed(place: Mapping[str, Any]) -> str:
 
 Check = Callable[[Case], Iterable[Fault]]
 
-_LABELS = (length, motion, instruction, labels, wording, provenance, place)
+_LABELS = (length, motion, instruction, labels, wording, provenance, results, place)
 _PICTURES = (jpeg, geometry, depth, boxes, video, cameras, alive)
 _EVERY = (*_LABELS, *_PICTURES, gripper, flags, clock, statistics)
 CHECKS: Mapping[str, Check] = {check.__name__: check for check in _EVERY}
