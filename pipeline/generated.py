@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import checksum, read_json, remove, replaced, write_json
@@ -25,7 +26,9 @@ MAX_NAMED = 20
 
 
 @contextmanager
-def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Iterator[Path]:
+def generated(
+    folder: Path, made_from: Mapping[str, str] | None = None, settings: Mapping[str, Any] | None = None
+) -> Iterator[Path]:
     """Yield an empty folder to write into; on success record its files and give it the place of ``folder``.
 
     A killed process leaves the old folder, the new one or none. If ``REMAKE=1`` allows the replacement of edits, the
@@ -33,6 +36,7 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
 
     Args:
         made_from: name of each file of the run that the content is generated from, to SHA-256.
+        settings: sections of the configuration to record, JSON-serialisable.
 
     Raises:
         PipelineError: if edits would be lost and ``REMAKE=1`` does not allow it; ``folder`` is then unchanged.
@@ -47,7 +51,8 @@ def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Itera
             # The permission may have been given for other work.
             old = _free_name(folder)
             print(f"generated {folder} again; the edited files {in_words(lost)} are now in {old}")
-        write_json(unfinished / RECORD, {"files": files, "made_from": dict(made_from or {})})
+        record = {"files": files, "made_from": dict(made_from or {}), "settings": dict(settings or {})}
+        write_json(unfinished / RECORD, record)
         if folder.exists():
             os.replace(folder, old)
     if not lost:
@@ -61,7 +66,11 @@ def _free_name(folder: Path) -> Path:
 
 
 def read_record(folder: Path) -> Record:
-    """Read the record of a generated folder, whose request is ``made_from``.
+    """Read the record of a generated folder.
+
+    Returns:
+        The record. Its request has ``files``, which are ``made_from`` of ``generated``, and ``settings``, which are
+        empty in records of earlier versions.
 
     Raises:
         PipelineError: if the record is missing or damaged.
@@ -70,11 +79,12 @@ def read_record(folder: Path) -> Record:
     content = read_json(file)
     try:
         files, made_from = dict(content["files"]), dict(content["made_from"])
+        settings = dict(content.get("settings", {}))
     except (KeyError, TypeError, ValueError) as error:
         raise PipelineError(
             f"the record is damaged ({error!r})", where=file, expected="the fields files and made_from"
         ) from error
-    return Record(Basis.of(made_from, {}), files)
+    return Record(Basis.of({"files": made_from, "settings": settings}, {}), files)
 
 
 def edits(folder: Path) -> dict[str, str]:

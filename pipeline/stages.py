@@ -364,7 +364,7 @@ STAGES = {
     "validate": Stage(validate),
     "recipe": Stage(write_recipe, ("export", "finetune"), (MANIFEST, *_RECORDS), (FINETUNE,)),
     "summary": Stage(summarize),
-    "card": Stage(write_card, ("export", "publish"), (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
+    "card": Stage(write_card, inputs.PUBLISHED, (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
     "report": Stage(write_report),
 }
 """Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""

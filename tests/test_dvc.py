@@ -56,6 +56,10 @@ def test_a_stage_that_writes_names_of_datasets_depends_on_the_options_of_every_f
     assert "export" in sections(name)
 
 
+def test_previews_depend_on_the_views() -> None:
+    assert "render" in sections("summary")
+
+
 def test_a_run_that_goes_on_elsewhere_is_compared_first() -> None:
     assert "host" in sections("doctor")
     assert DATA + "machine.json" in STAGES["plan"]["deps"]
@@ -97,6 +101,10 @@ def test_the_stage_of_exports_depends_on_the_inputs_of_each_group() -> None:
     assert {file for stage in exports for file in stage.inputs} <= needed
     sections_of_groups = {section for stage in exports for section in stage.settings}
     assert sections_of_groups == {section.partition(".")[0] for section in sections("exports")}
+
+
+def test_the_card_is_generated_again_after_every_change_that_it_records() -> None:
+    assert sections("card") == {*inputs.PUBLISHED} == {*stages.STAGES["card"].settings}
 
 
 def test_params_name_the_shipped_default() -> None:

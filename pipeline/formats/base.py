@@ -159,6 +159,8 @@ class Format(ABC, Generic[Options]):
     """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
     step_s: float
     """CPU time of one core to write one step of an episode, in s, on the reference machine of ``work_time.py``."""
+    validate_s: float = 0.0006
+    """CPU time of one core to read back and check one step of an episode, in s, on the same machine."""
     columns: ClassVar[tuple[pa.Field, ...]]
     """Columns of the manifest with the place of an episode; null when it was dropped."""
     keys: Mapping[str, str]

@@ -1,6 +1,6 @@
 """Records of a dataset that is read back: its copies of episodes, its files, and the faults of both."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,11 +62,13 @@ class Copy:
         decoded: (view, step) to the frame, for ``sampled`` steps, where frames are a video.
         marks: further columns of each step, by the dataset's own names, each (T,).
         place: place of the episode, by the format's columns of the manifest.
+        repeated: further name of a column of the provenance, to that column and the value under the further name.
         said: lerobot's column of persistent language, the entries of each step; ``None`` where the dataset has none.
         events: lerobot's column of language events, likewise.
         train: True if the episode is in the training split.
         statistics: statistics of the episode; ``None`` where the dataset states none.
-        lossless: True if the frames in ``decoded`` were stored without loss.
+        lossless_frames: function that yields the frames (H, W, 3) of a view at all steps, one at a time, if they are
+            stored without loss; else ``None``. It raises a PipelineError if a frame cannot be read.
         depth_m: (view, step) to the depth (H, W) in m, for ``sampled`` steps, where depth is a video.
     """
 
@@ -80,8 +82,9 @@ class Copy:
     events: Sequence[Sequence[Mapping[str, Any]]] | None = None
     train: bool = True
     statistics: Statistics | None = None
-    lossless: bool = False
+    lossless_frames: Callable[[str], Iterator[Frame]] | None = None
     depth_m: Mapping[tuple[str, int], NDArray[np.float32]] = field(default_factory=dict)
+    repeated: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.episode)

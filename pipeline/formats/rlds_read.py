@@ -238,4 +238,5 @@ def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
         decoded={},
         marks={name: steps[name] for name in MARKS},
         place={"rlds_shard": shard.name, "rlds_index": index},
+        repeated={"file_path": ("demo_source", _said(steps[f"{METADATA}file_path"][0]))},
     )

@@ -27,6 +27,7 @@ from pipeline.planning import leakage
 from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, Diversity, diversity, named, origins, tally, targets, tried
+from pipeline.run.inputs import published_settings
 from pipeline.run.layout import CARD, FINETUNE, MANIFEST, SHEETS
 from pipeline.run.run import Run
 from pipeline.testset import benchmark
@@ -70,7 +71,7 @@ def write(run: Run) -> None:
     axes = dict.fromkeys(row["axis"] for row in rows)
     sheets = [axis for axis in axes if (run.path(SHEETS) / f"{axis}.png").is_file()]
     made_from = {name: checksum(run.path(name)) for name in (MANIFEST, *REPORTS)}
-    with generated(run.path(CARD), made_from) as folder:
+    with generated(run.path(CARD), made_from, published_settings(run.config)) as folder:
         for dataset in formats:
             (folder / dataset.name / "pictures").mkdir(parents=True)
             for axis in sheets:

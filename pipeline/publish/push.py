@@ -36,7 +36,9 @@ from pipeline.publish.repository import (
     files_of,
     read,
 )
+from pipeline.record import Basis
 from pipeline.run.export import OFT_STATISTICS
+from pipeline.run.inputs import published_settings
 from pipeline.run.layout import CARD, FINETUNE
 from pipeline.run.run import Run
 
@@ -95,11 +97,13 @@ def prepare(target: Format[Any], run: Run) -> Upload:
         target: a dataset of the run.
 
     Raises:
-        PipelineError: when files are missing, foreign, not as recorded, not validated, or failed validation.
+        PipelineError: when files are missing, foreign, not as recorded, not validated, or failed validation; when the
+            configuration has changed since the card was generated.
     """
     recorded = target.record().files
     dataset = {target.repository_path(path): file for path, file in _exactly(target.folder, {*recorded}).items()}
     _reject_unvalidated(run, dataset, target.name)
+    _reject_other_settings(run)
     for file in target.written():
         for fault in file.faults():
             raise PipelineError(fault.what, expected=fault.expected)
@@ -112,7 +116,7 @@ def prepare(target: Format[Any], run: Run) -> Upload:
             others[name], sha256[name] = source, checksums[path]
     if CHECKSUMS in others:
         _reject_other_dataset(others[CHECKSUMS], sha256, dataset)
-    for name, recorded_sha256 in read_record(run.path(CARD)).basis.requested.items():
+    for name, recorded_sha256 in read_record(run.path(CARD)).basis.requested["files"].items():
         source = run.path(name)
         if source.is_symlink() or checksum(source) != recorded_sha256:
             raise PipelineError(
@@ -285,6 +289,20 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
     if missing:
         raise PipelineError(f"{len(missing)} files are missing, such as {missing[0]}", where=root, remedy=MAKE_AGAIN)
     return files
+
+
+def _reject_other_settings(run: Run) -> None:
+    """Raise an error if the configuration has changed since the card, the last output of a run, was generated."""
+    record = read_record(run.path(CARD))
+    files = record.basis.requested["files"]
+    changed = record.why_not(Basis.of({"files": files, "settings": published_settings(run.config)}, {}))
+    if changed:
+        raise PipelineError(
+            f"the card and the dataset are of another configuration: {changed}",
+            where=run.path(CARD),
+            expected="a card of the present configuration",
+            remedy=MAKE_AGAIN,
+        )
 
 
 def _reject_other_dataset(checksums: Path, sha256: Mapping[str, str], dataset: Iterable[str]) -> None:

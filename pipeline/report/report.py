@@ -266,6 +266,6 @@ _ConfigDumper.add_multi_representer(
 
 
 def _dumped(config: Config) -> str:
-    # The place of computation changes no result, and would make the pages differ.
-    chosen = config.model_dump(exclude_defaults=True, exclude={"compute", "folder"})
+    # The place of computation changes no result, and would make the pages differ. The card has `publish`.
+    chosen = config.model_dump(exclude_defaults=True, exclude={"compute", "folder", "publish"})
     return yaml.dump(chosen, Dumper=_ConfigDumper, sort_keys=False)

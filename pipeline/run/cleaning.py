@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.export_config import FAILURES
-from pipeline.files import remove
+from pipeline.files import keep_below, remove, remove_if_empty
 from pipeline.formats.registry import GROUPS, formats_in
 from pipeline.generated import reject_edits
 from pipeline.run.claim import locked, reject_unmarked
-from pipeline.run.export import reject_unrecorded
+from pipeline.run.export import put_away_records, reject_unrecorded
 from pipeline.run.foreign import reject_foreign_files
 from pipeline.run.layout import (
     CARD,
@@ -55,8 +55,11 @@ def _datasets(group: str) -> Part:
     return Part((*names, *of_failures), f"export_{group}, from the frames")
 
 
+UNFINISHED = "unfinished"
+"""Part of the unfinished files."""
+
 PARTS = {
-    "unfinished": Part((WORK, f"{FAILURES}/{WORK}"), "no stage (unfinished files of stopped stages)"),
+    UNFINISHED: Part((WORK, f"{FAILURES}/{WORK}"), "no stage (unfinished files of stopped stages)"),
     "pictures": Part((SHEETS, PREVIEWS, REPORT), "summary and report"),
     "uploads": Part((CARD, FINETUNE), "card and recipe"),
     **{group: _datasets(group) for group in GROUPS},
@@ -109,6 +112,8 @@ def reject_foreign(run: Run, parts: Iterable[str]) -> None:
 def delete(run: Run, parts: Iterable[str]) -> None:
     """Delete parts of a run's folder.
 
+    The records of edited datasets stay with their datasets, because a run finds edited files by them.
+
     Raises:
         PipelineError: when the folder has no mark of a run, a stage of the run is running, or a part holds files that
             no stage generated, or edited files.
@@ -117,9 +122,14 @@ def delete(run: Run, parts: Iterable[str]) -> None:
     with locked(run.folder):
         chosen = [*parts]
         reject_foreign(run, chosen)
-        for part in chosen:
-            for name in PARTS[part].names:
-                remove(run.path(name))
+        # Unfinished files come last, as they include records of datasets that other parts delete.
+        for part in sorted(chosen, key=UNFINISHED.__eq__):
+            for path in map(run.path, PARTS[part].names):
+                if part == UNFINISHED:
+                    keep_below(path, put_away_records(path))
+                    remove_if_empty(path)
+                else:
+                    remove(path)
 
 
 def size_mb(path: Path) -> float:

@@ -73,9 +73,12 @@ def export_run(kind: type[AnyFormat], run: Run) -> None:
 
 
 def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
+    # The stage may run without the stage `inputs`, which notices changes, too.
+    notice_changes(target)
     reject_foreign(target, episodes)
     reject_changed(target)
     if not episodes.ids and "outcome" in target.content.extras:
+        _reject_edits(target, target.record_file)
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
         print(f"no replay missed its goal, so {target.folder} was not written")
@@ -136,7 +139,11 @@ def reject_changed(target: AnyFormat) -> None:
     Raises:
         PipelineError: naming the file, unless ``REMAKE=1`` allows it.
     """
-    record_file = target.work / CHANGED / FINISHED
+    _reject_edits(target, target.work / CHANGED / FINISHED)
+
+
+def _reject_edits(target: AnyFormat, record_file: Path) -> None:
+    """Compare the content of every file of a dataset with a record, if it exists, as ``reject_changed`` describes."""
     if not record_file.is_file():
         return
     recorded = DatasetRecord.from_json(read_json(record_file)).files
@@ -314,6 +321,9 @@ def notice_changes(target: AnyFormat) -> None:
     """Put the record of a finished dataset whose files are missing or changed away, so that it counts as missing.
 
     The record returns if all files have their content again.
+
+    Raises:
+        PipelineError: when the record is unreadable, because edited files would not be found without it.
     """
     put_away = target.work / CHANGED / FINISHED
     if not target.record_file.exists() and put_away.is_file():
@@ -322,9 +332,13 @@ def notice_changes(target: AnyFormat) -> None:
         return
     try:
         record = target.record()
-    except PipelineError:
-        target.record_file.unlink()
-        return
+    except PipelineError as error:
+        raise PipelineError(
+            f"the record of the dataset cannot be read, so that edited files would not be found ({error.what})",
+            where=target.record_file,
+            expected="the record that the export wrote",
+            remedy=f"restore it from a copy, or move it and {target.folder} to another place",
+        ) from error
     try:
         same = all(checksum(target.folder / name) == sha256 for name, sha256 in record.files.items())
     except OSError:
@@ -334,6 +348,20 @@ def notice_changes(target: AnyFormat) -> None:
         return
     put_away.parent.mkdir(parents=True, exist_ok=True)
     os.replace(target.record_file, put_away)
+
+
+def put_away_records(work: Path) -> set[Path]:
+    """List the records of edited or incomplete datasets, which ``notice_changes`` put into a work folder.
+
+    Args:
+        work: folder with the work folders of all formats.
+    """
+    records: set[Path] = set()
+    for record in work.glob(f"*/{CHANGED}/{FINISHED}"):
+        name_of_format = record.relative_to(work).parts[0]
+        if (work.parent / name_of_format).is_dir():
+            records.add(record)
+    return records
 
 
 def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
@@ -346,8 +374,8 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         workers: get one call for each piece.
 
     Raises:
-        PipelineError: when an episode breaks the schema or the ids are unfit. The earlier dataset stays, and finished
-            pieces stay in the work folder.
+        PipelineError: when an episode breaks the schema or the ids are unfit, or when the earlier dataset has files
+            that the user stored or edited. The earlier dataset stays, and finished pieces stay in the work folder.
     """
     pieces, basis = target.pieces(episodes), compute_basis(target, episodes)
     work = target.work / basis.identity
@@ -378,11 +406,13 @@ def _replace(target: AnyFormat, work: Path) -> None:
         work: folder with the record, and with the folder ``dataset`` unless a killed call moved it.
     """
     if (work / "dataset").is_dir():
-        # The user may have stored files since the export began.
+        # The user may have stored or edited files since the export began. An edit may keep size and time of a file.
         recorded = _recorded(target)
         foreign = _unrecorded(target.folder, recorded)
         if foreign:
             raise _foreign_entries_error(target, foreign, {name.partition("/")[0] for name in recorded})
+        for record_file in (target.record_file, target.work / CHANGED / FINISHED):
+            _reject_edits(target, record_file)
         if target.folder.exists():
             os.replace(target.folder, target.work / BEFORE)
         target.record_file.unlink(missing_ok=True)  # This record is of the earlier dataset.

@@ -224,11 +224,14 @@ def _memory(
 
 
 def _settings_of_pictures(config: Config) -> dict[str, object]:
-    return {
+    settings: dict[str, object] = {
         "demos": settings_of(config.demos),
         "plan": settings_of(config.plan),
         "replay": settings_of(config.replay),
     }
+    if config.render.views:  # Without further views, pictures of earlier versions stay up to date.
+        settings["views"] = [*config.render.views]
+    return settings
 
 
 def _contents(paths: Sequence[Path], data: Path) -> Mapping[str, str]:

@@ -25,6 +25,9 @@ HASHED_BYTES = 16_000_000
 SECTIONS = ("demos", "plan", "replay", "filter", "render", "export", "finetune", "compute", "publish")
 """Sections of a configuration, in the order of ``settings.json``."""
 
+PUBLISHED = tuple(name for name in SECTIONS if name != "compute")
+"""Sections on which the content of datasets and cards depends."""
+
 
 def listing(config: Config) -> dict[str, list[str | int]]:
     """Map each file that the configuration's paths lead to, to a state that differs once the file has changed.
@@ -55,6 +58,12 @@ def settings(config: Config) -> dict[str, Any]:
     # Fields that are left out at their default; DVC stops where a parameter is missing.
     defaults = {name: field.default for name, field in ExportConfig.model_fields.items() if field.exclude_if}
     return {**sections, "export": {**defaults, **sections["export"]}, "host": host()}
+
+
+def published_settings(config: Config) -> dict[str, Any]:
+    """Return the sections of ``PUBLISHED`` with all fields, which a card records."""
+    sections = settings(config)
+    return {name: sections[name] for name in PUBLISHED}
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +46,14 @@ class StoredEpisode:
 
     Attributes:
         episode_id: this project's name of the episode, or else the dataset's.
-        instruction: text that the policy gets; `None` if the dataset has no text.
+        instructions: distinct texts that the policy gets at any step; empty if the dataset has no text.
         extrinsics: (4, 4) from the agent view to the world (z forward, y down); `None` if the dataset has no matrices.
         suite, task: labels, which may name a task that this project does not have; `None` without labels.
         perturbations: labels as the manifest writes them; `None` without labels.
     """
 
     episode_id: str
-    instruction: str | None
+    instructions: tuple[str, ...]
     extrinsics: Floats | None = None
     suite: str | None = None
     task: str | None = None
@@ -122,7 +122,7 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
         unlabelled=len(unlabelled),
         without_camera=sum(episode.extrinsics is None for episode in unlabelled),
         without_task=len(without_task),
-        without_instruction=sum(episode.instruction is None for episode in episodes),
+        without_instruction=sum(not episode.instructions for episode in episodes),
         unplaced=dict(unplaced),
     )
 
@@ -164,8 +164,9 @@ def _rlds(folder: Path) -> Iterator[StoredEpisode]:
             stored = {name.removeprefix(METADATA): value for name, value in step.items() if name.startswith(METADATA)}
             text = {name: stored[name][0].decode() for name in ("episode_id", *LABELS) if name in stored}
             episode_id = text.pop("episode_id", "") or f"{shard.name}:{number}"
-            instruction = step["language_instruction"][0].decode() or None
-            yield StoredEpisode(episode_id, instruction, stored.get("image_extrinsics"), **text)
+            texts = dict.fromkeys(step["language_instruction"].tolist())
+            instructions = tuple(text.decode() for text in texts if text)
+            yield StoredEpisode(episode_id, instructions, stored.get("image_extrinsics"), **text)
 
 
 def _lerobot(folder: Path) -> Iterator[StoredEpisode]:
@@ -188,7 +189,7 @@ def _lerobot(folder: Path) -> Iterator[StoredEpisode]:
         matrix = row.get(camera_column("image", "extrinsics"))
         yield StoredEpisode(
             row.get(EPISODE_ID) or ids.get(index) or f"episode {index}",
-            next(iter(episode["tasks"]), None),
+            tuple(dict.fromkeys(text for text in episode["tasks"] if text)),
             None if matrix is None else np.reshape(matrix, SCHEMA.extrinsics.shape),
             **{name: row.get(name) for name in LABELS},
         )
@@ -221,15 +222,19 @@ def _row(episode: StoredEpisode, task: Task | None, test: TestSet) -> Compared:
         if None not in cameras:
             anywhere = tasks(TESTED_SUITES[0])[0]
             perturbations.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
-    text = episode.instruction
-    rewrites = []
-    if text is not None and not unknown and (task is None or normalise(text) != normalise(task.instruction)):
-        rewrites = [LanguagePerturbation(component="paraphrase", level=1, text=text)]
-    if task is None:
-        # Without a task, the episode is compared with the task whose test instructions are nearest.
-        every = list(chain.from_iterable(map(tasks, TESTED_SUITES)))
-        task = min(every, key=lambda task: rewrites[0].nearest(test, task).distance) if rewrites else every[0]
-    return Compared(episode.episode_id, task.suite, task.name, to_json([*perturbations, *rewrites]))
+    rewrites: list[LanguagePerturbation] = []
+    for text in () if unknown else episode.instructions:
+        if task is None or normalise(text) != normalise(task.instruction):
+            rewrites.append(LanguagePerturbation(component="paraphrase", level=1, text=text))
+    # Without a task, the episode is compared with the task whose test instructions are nearest.
+    compared_tasks = list(chain.from_iterable(map(tasks, TESTED_SUITES))) if task is None else [task]
+    nearest, task = None, compared_tasks[0]
+    if rewrites:
+        # An episode may have several texts; the nearest one counts.
+        pairs = product(rewrites, compared_tasks)
+        nearest, task = min(pairs, key=lambda pair: pair[0].nearest(test, pair[1]).distance)
+    shown = [*perturbations, *([nearest] if nearest else [])]
+    return Compared(episode.episode_id, task.suite, task.name, to_json(shown))
 
 
 def _labels(episode: StoredEpisode) -> list[Perturbation]:
@@ -263,7 +268,8 @@ def _task_of(episode: StoredEpisode) -> Task | None:
             return find_task(episode.suite, episode.task)
         except PipelineError:
             return None
-    return None if episode.instruction is None else _tasks_by_text().get(normalise(episode.instruction))
+    known = (_tasks_by_text().get(normalise(text)) for text in episode.instructions)
+    return next(filter(None, known), None)
 
 
 @cache

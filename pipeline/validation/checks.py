@@ -1,5 +1,6 @@
 """Checks of an episode in all places that store it: each is a small function that yields the errors it finds."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -13,12 +14,13 @@ from pipeline.axes.language import LanguagePerturbation, list_rewrites
 from pipeline.catalogue.scene_files import portable
 from pipeline.episode_check import label_faults
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, labels_of
+from pipeline.errors import PipelineError
 from pipeline.formats.annotations import event_annotations, persistent_annotations
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.stated_statistics import FIGURES, complete, wrong_depth, wrong_numbers, wrong_pixels, wrong_sample
-from pipeline.images.jpeg import decode_exactly
+from pipeline.images.jpeg import decode, decode_exactly
 from pipeline.libero.carried import definition_of
-from pipeline.libero.tasks import WITHOUT_DEBRIS, debris
+from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, exceeds_step_limit
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.run.manifest import labels_of as labels_of_row
 from pipeline.types import Frame
@@ -247,6 +249,22 @@ def provenance(case: Case) -> Iterator[Fault]:
             value, expected = copy.episode.provenance.get(column), case.row[column]
             if value != expected and column != OWN_VERSION:
                 yield case.finding(copy.dataset, f"{column} is {value!r}", repr(expected))
+        for name, (column, value) in copy.repeated.items():
+            if value != case.row[column]:
+                yield case.finding(copy.dataset, f"{name} is {value!r}", f"{case.row[column]!r}, as {column}")
+
+
+def results(case: Case) -> Iterator[Fault]:
+    """Compute results that the manifest states again from the actions and the start of the replay."""
+    actions, row = case.trajectory.actions, case.row
+    expected = {
+        "actions_sha256": hashlib.sha256(actions.astype(np.float32).tobytes()).hexdigest(),
+        "resolved": case.trajectory.resolved,
+        "exceeds_step_limit": exceeds_step_limit(row["suite"], len(actions)),
+    }
+    for column, value in expected.items():
+        if row[column] != value:
+            yield case.finding("manifest", f"{column} is {row[column]!r}", repr(value))
 
 
 def place(case: Case) -> Iterator[Fault]:
@@ -266,12 +284,22 @@ def jpeg(case: Case) -> Iterator[Fault]:
             if wrong:
                 what = f"{view} differs at {len(wrong)} steps, first at {wrong[0]}"
                 yield case.finding(copy.dataset, what, "the stored JPEG")
-        for (view, step), frame in copy.decoded.items() if copy.lossless else ():
-            stored = case.stored[view].frames.get(step)
-            if stored is not None and not np.array_equal(frame, stored):
-                yield case.finding(
-                    copy.dataset, f"{view} of step {step} has other pixels", "the pixels of the stored JPEG"
-                )
+        if copy.lossless_frames is not None:
+            yield from _pixels(case, copy, copy.lossless_frames)
+
+
+def _pixels(case: Case, copy: Copy, frames_of: Callable[[str], Iterator[Frame]]) -> Iterator[Fault]:
+    """Compare every frame of a copy with the decoded JPEG file of its step."""
+    for view, files in case.made.frames.items():
+        try:
+            pairs = zip(frames_of(view), files, strict=False)
+            wrong = [step for step, (frame, file) in enumerate(pairs) if not np.array_equal(frame, decode(file))]
+        except PipelineError as error:
+            yield case.finding(copy.dataset, f"{view}: {error}", "frames that can be read")
+            continue
+        if wrong:
+            what = f"{view} has other pixels at {len(wrong)} steps, first at {wrong[0]}"
+            yield case.finding(copy.dataset, what, "the pixels of the stored JPEG")
 
 
 def geometry(case: Case) -> Iterator[Fault]:
@@ -493,7 +521,7 @@ def _listed(place: Mapping[str, Any]) -> str:
 
 Check = Callable[[Case], Iterable[Fault]]
 
-_LABELS = (length, motion, instruction, labels, wording, provenance, place)
+_LABELS = (length, motion, instruction, labels, wording, provenance, results, place)
 _PICTURES = (jpeg, geometry, depth, boxes, video, cameras, alive)
 _EVERY = (*_LABELS, *_PICTURES, gripper, flags, clock, statistics)
 CHECKS: Mapping[str, Check] = {check.__name__: check for check in _EVERY}

@@ -53,8 +53,6 @@ SHADOWS_S, SHADOWS = 0.13, 0.4
 """Time that shadows add to a frame, and the share of the light episodes that have them."""
 MAPS_S = 0.045
 """Depth, segmentation, boxes, or all of them, of a view of one step: a second rendering, and PNG files."""
-VALIDATE_S = 0.0006
-"""A step of an episode in ``validate``."""
 FIXED_S = 100.0
 """Wall-clock time of starting the stages, previews, sheets and report, with any number of workers."""
 IN_TURN = ("rest", "GPU")
@@ -138,7 +136,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
         "replay": trajectories * replay_s(amounts.mean_steps, speed),
         "render": encoded_s + rendered_s * (not speed.gpus),
         "export": processor * exported_steps * sum(dataset.step_s for dataset in datasets),
-        "validate": processor * exported_steps * VALIDATE_S * len(datasets),
+        "validate": processor * exported_steps * sum(dataset.validate_s for dataset in datasets),
         "rest": processor * FIXED_S,
     } | ({"GPU": rendered_s / speed.gpus} if speed.gpus else {})
 

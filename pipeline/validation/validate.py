@@ -26,7 +26,7 @@ from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.rlds_layout import datasets
 from pipeline.grouping import grouped
 from pipeline.physics.quality import measure
-from pipeline.planning import selection
+from pipeline.planning import plan, selection
 from pipeline.rendering.renderer import scene_of_process
 from pipeline.run import outcome
 from pipeline.run.counts import by_axis_and_suite
@@ -34,6 +34,7 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.layout import COUNTS, STATISTICS, WORK
 from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
+from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import compare_frames, compare_subtasks, witnesses
@@ -84,6 +85,8 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
     kept = {row["episode_id"]: row for row in rows if row["kept"]}
     total = Results()
     total.note("counts", _counts(run), len(rows))
+    total.note("plan", _unlike_plan(run), len(rows))
+    total.note("stores", _unlike_stores(run), len(rows))
     with scratch(run.path(WORK) / "validate") as cache:
         try:
             job = EpisodesJob(run, run.formats, cache, frozenset(witnesses(rows)))
@@ -173,6 +176,55 @@ def _counts(run: Run) -> Iterator[Fault]:
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
     if read_json(run.path(COUNTS)) != by_axis_and_suite(rows):
         yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts of the rows")
+
+
+def _unlike_plan(run: Run) -> Iterator[Fault]:
+    """Compare the plan's columns of the manifest with the plan, and ``chosen`` with ``export.where``."""
+    where = run.config.export.where
+    for planned, row in _planned_rows(run):
+        chosen = where is None or where.takes(planned.axis, planned.component, planned.level, planned.suite)
+        yield from _unlike_row(row, {**asdict(planned), "chosen": chosen})
+
+
+def _unlike_stores(run: Run) -> Iterator[Fault]:
+    """Compare the results in the manifest with the tables of trajectories and frames.
+
+    The check ``results`` compares results of the kept rows with the stored files.
+    """
+    try:
+        trajectories, frames = run.trajectories.rows(), frames_by_trajectory(run.frames.rows())
+    except PipelineError as error:
+        yield Fault("frames", None, str(error), "the output of the run")
+        return
+    trajectory_of = {row.episode_id: row.trajectory_id for row in run.plan}
+    for planned, row in _planned_rows(run):
+        # The trajectory of a reserve that was not needed may be stored for another episode.
+        needed = row["reason"] != selection.NOT_NEEDED
+        replayed = trajectories.get(planned.trajectory_id, {}) if needed else {}
+        twin = trajectories.get(trajectory_of[planned.twin_id], {})
+        rendered = bool(replayed) and outcome.has_frames(planned, frames)
+        path_m, twin_path_m = replayed.get("path_m"), twin.get("path_m")
+        expected = {
+            "steps": replayed.get("steps"),
+            "replay_mode": replayed.get("mode"),
+            "path_ratio": path_m / twin_path_m if path_m is not None and twin_path_m else None,
+            "gl_device": frames[planned.trajectory_id].device if rendered else None,
+        }
+        yield from _unlike_row(row, expected)
+
+
+def _planned_rows(run: Run) -> Iterator[tuple[plan.Row, Row]]:
+    """Yield each row of the plan with its row of the manifest; ``_counts`` reports missing rows."""
+    row_of = {row["episode_id"]: row for row in run.manifest}
+    for planned in run.plan:
+        if planned.episode_id in row_of:
+            yield planned, row_of[planned.episode_id]
+
+
+def _unlike_row(row: Row, expected: Mapping[str, Any]) -> Iterator[Fault]:
+    for column, value in expected.items():
+        if row[column] != value:
+            yield Fault("manifest", row["episode_id"], f"{column} is {row[column]!r}", repr(value))
 
 
 def _as_a_whole(dataset: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:

@@ -103,6 +103,7 @@ def checks() -> dict[str, Any]:
     )
     row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
     row |= {"kept": True, "steps": steps + 1, "place": 1, "instruction": "task_1"}
+    row |= {"actions_sha256": "0", "resolved": "{}", "exceeds_step_limit": True}
     row |= {**labels_of(made), "rewrites": json.dumps(list(made.rewrites))}
     view, second_view = SCHEMA.views
     decoded = {(name, t): decode(made.frames[name][t]) for name, t in product(SCHEMA.views, sampled(steps))}

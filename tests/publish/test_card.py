@@ -22,14 +22,16 @@ from card_of_run import (
     write_rows,
     written,
 )
-from conftest import BOWL, MILK, STOVE
+from conftest import BOWL, MILK, STOVE, run_in
 
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
+from pipeline.formats.hdf5 import Hdf5Config
 from pipeline.formats.lerobot import LeRobotConfig
 from pipeline.formats.rlds import RldsConfig
+from pipeline.publish import card
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
 
@@ -80,6 +82,12 @@ def test_distinct_action_sequences_are_counted_by_task(data: Path) -> None:
     assert cells(text, str(MILK), "Diversity") == ["5", "2", "4"]
     assert cells(text, str(STOVE), "Diversity") == ["2", "1", "2"]
     assert cells(text, "**all**", "Diversity") == ["7", "3", "6"]
+
+
+def test_tasks_of_equal_names_in_two_suites_are_two(data: Path) -> None:
+    assert "demonstrations of 2 tasks." in written(data, "rlds")
+    write_rows(data, [*ROWS, row("clean") | {"suite": "libero_90", "demo_id": f"libero_90/{MILK.name}/demo_0"}])
+    assert "demonstrations of 3 tasks." in written(data, "rlds")
 
 
 def test_distances_are_those_of_the_episodes_in_the_dataset(data: Path) -> None:
@@ -190,6 +198,20 @@ def test_columns_in_addition_to_the_frames_are_described_where_they_are_there(da
     assert "65535 is 6.5535 m or more;\n  a unit is 0.0001 m." in full
     assert "`instances`" in written(data, kind, extras=("segmentation",))
     assert "`instances`" not in written(data, kind, extras=("depth",))
+
+
+@pytest.mark.parametrize(("views", "all_of_them"), [((), "Both"), (("frontview",), "All")])
+def test_frames_that_are_not_turned_are_described_without_a_contradiction(
+    data: Path, views: tuple[str, ...], all_of_them: str
+) -> None:
+    options = OPTIONS.model_copy(update={"hdf5": Hdf5Config(name=NAME)})
+    card.write(run_in(data, export=options, render={"views": views}))
+    text = (data / "card" / "hdf5" / "README.md").read_text()
+    assert f"  {all_of_them} are the simulator's own pictures" in text
+    # LIBERO's raw frame begins with its lowest row: columns run with the camera's x, and rows against its y.
+    assert "fx is positive and fy is negative" in text
+    assert "fx is negative" not in text
+    assert f"  {all_of_them} are rotated by 180 degrees" in (data / "card" / "rlds" / "README.md").read_text()
 
 
 def test_depth_as_video_and_its_readers_are_named(data: Path) -> None:

@@ -5,6 +5,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import REPOSITORY, Once, dvc, rot
@@ -199,6 +200,34 @@ def test_the_card_of_an_earlier_dataset_is_rejected(data: Path) -> None:
         prepare(data, "lerobot")
     write_card(data, checksums=True)
     assert prepare(data, "lerobot").files
+
+
+@pytest.mark.parametrize(
+    ("sections", "changed"),
+    [
+        ({"publish": {"licence": "CC-BY-NC-4.0", "author": "Jane Doe"}}, r"changed publish\.licence, publish\.author"),
+        ({"export": {"where": {"axis": ["clean"]}}}, r"changed export\.where"),
+        ({"finetune": {"rewrite_probability": 0.5}}, r"changed finetune\.rewrite_probability"),
+        ({"render": {"jpeg_quality": 80}}, r"changed render\.jpeg_quality"),
+    ],
+)
+def test_a_card_of_another_configuration_is_rejected(data: Path, sections: dict[str, Any], changed: str) -> None:
+    with pytest.raises(
+        PipelineError, match=rf"card: the card and the dataset are of another .*: {changed}\n"
+    ) as caught:
+        prepare(data, "lerobot", **sections)
+    assert "try: python -m pipeline run CONFIG" in str(caught.value)
+    assert prepare(data, "lerobot", compute={"workers": 1}).files, "the place of the computation changes nothing"
+
+
+def test_a_card_without_settings_is_rejected(data: Path) -> None:
+    """Earlier versions recorded none; the next run generates the card again."""
+    record_file = data / "card" / ".generated.json"
+    record = json.loads(record_file.read_text())
+    del record["settings"]
+    record_file.write_text(json.dumps(record))
+    with pytest.raises(PipelineError, match="of another configuration"):
+        prepare(data, "lerobot")
 
 
 def test_files_next_to_the_card_of_another_format_stop_nothing(data: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,12 +17,14 @@ from pipeline.generated import generated
 from pipeline.publish import push
 from pipeline.publish.card import REPORTS
 from pipeline.publish.push import Upload
+from pipeline.run.inputs import published_settings
 
 NAME = "tiny"
 RUN = "tiny_run"
 
 
-def prepare(data: Path, kind: str) -> Upload:
+def prepare(data: Path, kind: str, **sections: Any) -> Upload:
+    """Gather the files of a dataset, with other ``sections`` of the configuration."""
     options = ExportConfig.model_validate(
         {
             "rlds": RldsConfig(name="synthetic", shards=3),
@@ -29,7 +32,9 @@ def prepare(data: Path, kind: str) -> Upload:
             "lerobot_v21": LeRobotV21Config(name="synthetic", convention="ipec"),
         }
     )
-    return push.prepare(next(target for target in options.datasets(data) if target.name == kind), run_in(data))
+    return push.prepare(
+        next(target for target in options.datasets(data) if target.name == kind), run_in(data, **sections)
+    )
 
 
 def write_run(data: Path) -> None:
@@ -49,7 +54,7 @@ def write_run(data: Path) -> None:
 
 def write_card(data: Path, *, checksums: bool = False) -> None:
     made_from = {name: checksum(data / name) for name in ("manifest.parquet", *REPORTS)}
-    with generated(data / "card", made_from) as card:
+    with generated(data / "card", made_from, published_settings(run_in(data).config)) as card:
         for kind in ("rlds", "lerobot", "lerobot_v21"):
             (card / kind / "pictures").mkdir(parents=True)
             (card / kind / "README.md").write_text(f"---\nlicense: mit\n---\n{kind}: hf download OWNER/NAME\n")

@@ -25,6 +25,7 @@ from pipeline.images.jpeg import encode
 from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
+from pipeline.publish_config import PublishConfig
 from pipeline.report import coverage, figures, pages, report, seen, yields
 from pipeline.run import counts, manifest
 from pipeline.run.episode_loader import EpisodeLoader
@@ -89,6 +90,12 @@ def test_what_was_not_compared_and_not_measured_is_said() -> None:
     text = _rendered(leakage={"pose": pose})
     assert "perturbations not compared test tasks comparisons pose disjoint where compared - 1 0 55 53 696 4" in text
     assert "At most 200 episodes of each axis are measured" in text
+
+
+def test_statements_of_the_card_do_not_change_the_page(config: Config, html: str) -> None:
+    """The stage ``report`` does not start again when ``publish`` changes."""
+    stated = config.model_copy(update={"publish": PublishConfig(licence="MIT", author="Jane Doe")})
+    assert report.page(Run(stated), benchmark.load(REPOSITORY / benchmark.FOLDER)) == html
 
 
 def test_links_lead_to_sections_and_to_files_of_the_run(page: Page, finished: Path) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import dvc, rot
+from conftest import dvc, rot, run_in
 from synthetic import episodes, write_rlds
 
 from pipeline import identity, stages
@@ -77,6 +77,17 @@ def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[boo
     changed = largest(file) if file.is_dir() else file
     changed.write_bytes(changed.read_bytes() + b"\n")
     assert hold(config) == expected
+
+
+def test_previews_are_rendered_again_for_other_views(tmp_path: Path) -> None:
+    previews_memory(run_in(tmp_path)).keep()
+    assert previews_memory(run_in(tmp_path)).holds()
+    assert previews_memory(run_in(tmp_path, render={"size_px": 128})).holds(), "previews have a size of their own"
+    further = run_in(tmp_path, render={"views": ["frontview"]})
+    assert not previews_memory(further).holds()
+    previews_memory(further).keep()
+    assert previews_memory(further).holds()
+    assert not previews_memory(run_in(tmp_path, render={"views": ["birdview"]})).holds()
 
 
 @pytest.mark.parametrize(

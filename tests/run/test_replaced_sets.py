@@ -7,17 +7,23 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import run_in
 from synthetic import episode, episodes, files
 
 from pipeline.config import Config
+from pipeline.episode_schema import Content
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Format
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
+from pipeline.run import cleaning
+from pipeline.run.claim import OWNER
 from pipeline.run.export import _bring_up_to_date, notice_changes
 from pipeline.run.run import Run
 from pipeline.types import Episode
@@ -89,17 +95,126 @@ def test_an_edited_file_is_replaced_only_where_that_is_allowed(
     assert files(tmp_path) == expected
 
 
-@pytest.mark.parametrize("lost", ["truncated", "deleted"])
-def test_a_file_of_the_user_stays_where_the_record_is_lost(lost: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", ["first", "second"], ids=["the same dataset", "another dataset"])
+def test_an_edited_file_is_noticed_by_the_stage_of_the_export_alone(content: str, tmp_path: Path) -> None:
+    command("rlds", tmp_path)
+    edited = next(tmp_path.rglob("dataset_info.json"))
+    edited.write_bytes(b"mine")
+    for _ in range(2):
+        with pytest.raises(PipelineError, match=r"dataset_info\.json: the file was edited or damaged"):
+            _bring_up_to_date(target("rlds", tmp_path, "new"), episodes(content=content), RUN)
+    assert edited.read_bytes() == b"mine"
+
+
+def test_an_edit_that_keeps_size_and_time_stops_the_replacement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command("rlds", tmp_path)
+    export_target, edited = target("rlds", tmp_path, "new"), next(tmp_path.rglob("dataset_info.json"))
+    before, original = edited.stat(), edited.read_bytes()
+    mine = original.replace(b"rlds", b"mine") if b"rlds" in original else original[::-1]
+    edited.write_bytes(mine)
+    os.utime(edited, ns=(before.st_atime_ns, before.st_mtime_ns))
+    for _ in range(2):
+        with pytest.raises(PipelineError, match=r"dataset_info\.json: the file was edited or damaged") as caught:
+            _bring_up_to_date(export_target, episodes(content="second"), RUN)
+        assert "REMAKE=1" in str(caught.value)
+    assert edited.read_bytes() == mine
+    monkeypatch.setenv("REMAKE", "1")
+    _bring_up_to_date(export_target, episodes(content="second"), RUN)
+    assert edited.read_bytes() == original
+    assert not export_target.work.exists()
+
+
+def test_a_file_that_the_user_edits_during_an_export_stays(tmp_path: Path) -> None:
+    command("rlds", tmp_path)
+    edited = next(tmp_path.rglob("dataset_info.json"))
+    original = edited.read_bytes()
+
+    def load(episode_id: str) -> Episode:
+        edited.write_bytes(b"mine")
+        return episode(episode_id)
+
+    export_target = target("rlds", tmp_path, "new")
+    with pytest.raises(PipelineError, match=r"dataset_info\.json: the file was edited or damaged"):
+        _bring_up_to_date(export_target, episodes(load, content="second"), RUN)
+    assert edited.read_bytes() == b"mine"
+    edited.write_bytes(original)
+    _bring_up_to_date(export_target, episodes(content="second"), RUN)
+    assert not export_target.work.exists()
+
+
+def test_failures_that_no_longer_exist_are_not_deleted_with_an_edit(tmp_path: Path) -> None:
+    content = Content(extras=("outcome",))
+    failures = Rlds(tmp_path, RldsConfig(name="new", shards=2), content)
+    lost: dict[str, Any] = {"success": False, "reason": "goal_lost"}
+
+    def load(episode_id: str) -> Episode:
+        made = episode(episode_id)
+        return replace(made, provenance={**made.provenance, **lost})
+
+    _bring_up_to_date(failures, episodes(load), RUN)
+    edited = next(tmp_path.rglob("dataset_info.json"))
+    before, original = edited.stat(), edited.read_bytes()
+    edited.write_bytes(original[::-1])
+    os.utime(edited, ns=(before.st_atime_ns, before.st_mtime_ns))
+    none = Episodes({}, load)
+    with pytest.raises(PipelineError, match=r"dataset_info\.json: the file was edited or damaged"):
+        _bring_up_to_date(failures, none, RUN)
+    edited.write_bytes(original)
+    _bring_up_to_date(failures, none, RUN)
+    assert not failures.folder.exists()
+
+
+def test_cleaning_unfinished_files_keeps_the_record_of_an_edited_dataset(tmp_path: Path) -> None:
+    run = run_in(tmp_path)
+    (tmp_path / OWNER).write_text("{}")
+    command("rlds", tmp_path)
+    expected = files(tmp_path)
+    edited = next(tmp_path.rglob("dataset_info.json"))
+    edited.write_bytes(b"mine")
+    unfinished = tmp_path / ".work" / "rlds" / "piece"
+    with pytest.raises(PipelineError, match="edited or damaged"):
+        command("rlds", tmp_path)
+    unfinished.write_bytes(b"of a killed call")
+    cleaning.delete(run, ["unfinished"])
+    assert not unfinished.exists()
+    with pytest.raises(PipelineError, match=r"dataset_info\.json: the file was edited or damaged"):
+        command("rlds", tmp_path)
+    assert edited.read_bytes() == b"mine"
+    edited.write_bytes(expected[str(edited.relative_to(tmp_path))])
+    command("rlds", tmp_path)
+    assert files(tmp_path).items() >= expected.items(), "its record returned"
+    edited.write_bytes(b"mine")
+    with pytest.raises(PipelineError, match="edited or damaged"):
+        command("rlds", tmp_path)
+    cleaning.delete(run, ["unfinished", "rlds"])
+    assert not {"rlds", "rlds.json", ".work"} & {path.name for path in tmp_path.iterdir()}
+
+
+def test_an_unreadable_record_is_named_and_nothing_is_deleted(tmp_path: Path) -> None:
+    command("rlds", tmp_path)
+    expected = files(tmp_path)
+    export_target = target("rlds", tmp_path, "new")
+    record = export_target.record_file
+    whole = record.read_bytes()
+    record.write_bytes(whole[:99])
+    for _ in range(2):
+        with pytest.raises(PipelineError, match=r"rlds\.json: the record of the dataset cannot be read") as caught:
+            command("rlds", tmp_path)
+        assert f"try: restore it from a copy, or move it and {export_target.folder} to another" in str(caught.value)
+    assert files(tmp_path) == {**expected, "rlds.json": whole[:99]}
+    record.write_bytes(whole)
+    command("rlds", tmp_path)
+    assert files(tmp_path) == expected
+
+
+def test_a_file_of_the_user_stays_where_the_record_is_lost(tmp_path: Path) -> None:
     command("rlds", tmp_path)
     expected = files(tmp_path)
     note = next(tmp_path.rglob("dataset_info.json")).with_name("note.csv")
     note.write_text("of the user")
-    record = target("rlds", tmp_path, "new").record_file
-    if lost == "truncated":
-        record.write_bytes(record.read_bytes()[:99])
-    else:
-        record.unlink()
+    target("rlds", tmp_path, "new").record_file.unlink()
     with pytest.raises(PipelineError, match=r"note\.csv"):
         command("rlds", tmp_path)
     assert note.read_text() == "of the user"

@@ -3,7 +3,7 @@
 import json
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from libero.libero.envs import TASK_MAPPING
 from scipy.spatial.transform import Rotation
-from synthetic import IDS, NAME, episode, loop
+from synthetic import IDS, NAME, episode, loop, records
 
 from pipeline.__main__ import main
 from pipeline.axes import AXES
@@ -23,6 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
+from pipeline.formats.tfrecord import framed
 from pipeline.libero.arenas import ARENAS, Arena
 from pipeline.libero.tasks import find_task
 from pipeline.run.export import export
@@ -103,6 +104,44 @@ def test_planted_tasks_are_found_whatever_the_labels_say(datasets: Path, test: T
         "noise": (1, 1, LABELLED),
     }
     assert found.axes["camera"].smallest == pytest.approx(0.0, abs=1e-3)
+
+
+def precede_in_rlds(folder: Path, text: str) -> None:
+    """Replace the instruction of the first step by other words of equal length."""
+    for shard in folder.rglob("*.tfrecord-*"):
+        changed = []
+        for record in records(shard):
+            before, name, after = record.partition(b"steps/language_instruction")
+            changed.append(before + name + after.replace(text.encode(), b"x" * len(text.encode()), 1))
+        shard.write_bytes(b"".join(map(framed, changed)))
+
+
+def precede_in_lerobot(folder: Path, text: str) -> None:
+    (file,) = folder.rglob("meta/episodes/*/*.parquet")
+    rows = pq.read_table(file).to_pylist()
+    rows[IDS.index(WORDS)]["tasks"] = [TASK.instruction, text]
+    pq.write_table(pa.Table.from_pylist(rows, schema=pq.read_schema(file)), file)
+
+
+def precede_in_version_21(folder: Path, text: str) -> None:
+    (file,) = folder.rglob("episodes.jsonl")
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    rows[IDS.index(WORDS)]["tasks"] = [TASK.instruction, text]
+    file.write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+
+
+@pytest.mark.parametrize(
+    ("name", "precede"),
+    [("rlds", precede_in_rlds), ("lerobot", precede_in_lerobot), ("lerobot_v21", precede_in_version_21)],
+)
+def test_a_test_instruction_is_found_behind_another_text_of_the_episode(
+    name: str, precede: Callable[[Path, str], None], datasets: Path, test: TestSet, tmp_path: Path
+) -> None:
+    edited = tmp_path / "edited"
+    shutil.copytree(datasets / name, edited)
+    precede(edited, str(test.on(TASK, "language")[0].parameters["text"]))
+    language = audit(edited, test).axes["language"]
+    assert (language.rows, language.overlaps, language.closest) == (1, 1, WORDS)
 
 
 def test_what_lost_its_labels_is_known_by_its_instruction_and_by_a_manifest(

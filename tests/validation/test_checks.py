@@ -1,6 +1,7 @@
 """Faults that no dataset shows by itself: of the stores, of the manifest's instruction, and of its numbers."""
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,14 @@ from pipeline.config import PlanConfig, RenderConfig, ReplayConfig
 from pipeline.files import write_json
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Scene, Trajectory, Verdict
+from pipeline.types import Jpeg, Quality, Rendered, Scene, Trajectory, Verdict
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
-from pipeline.validation.validate import _counts
+from pipeline.validation.validate import _counts, _unlike_plan, _unlike_stores
 
 MADE = episode(IDS[0])
 
@@ -69,6 +71,19 @@ def test_a_rewrite_that_no_bank_has_is_found() -> None:
         assert [fault.what for fault in CHECKS["wording"](case(**row))] == found
 
 
+def test_results_that_do_not_follow_from_the_replay_are_found() -> None:
+    stated = {
+        # Of the actions' bytes, in float32.
+        "actions_sha256": hashlib.sha256(MADE.action.tobytes()).hexdigest(),
+        "resolved": "{}",
+        "exceeds_step_limit": False,
+    }
+    assert list(CHECKS["results"](case(suite=BOWL.suite, **stated))) == []
+    for column, other in (("actions_sha256", "0" * 64), ("resolved", '{"robot": 1}'), ("exceeds_step_limit", True)):
+        (fault,) = CHECKS["results"](case(suite=BOWL.suite, **{**stated, column: other}))
+        assert (fault.dataset, fault.what) == ("manifest", f"{column} is {other!r}")
+
+
 Rows = list[dict[str, Any]]
 
 
@@ -84,6 +99,73 @@ def lose_a_row(rows: Rows) -> None:
     del rows[-1]
 
 
+def write_plan(folder: Path) -> Rows:
+    """Plan a clean twin, and two noisy episodes with one in reserve; return the rows of a manifest."""
+    demos = [DemoEntry(BOWL, "demo_0", "test", "human", "0", steps=100)]
+    noisy = PlanConfig(seed=0, axes=Axes(noise=NoiseAxis()), episodes={"noise": 2}, reserve=0.5)
+    planned = plan.make(demos, noisy, ReplayConfig(), TestSet(()))
+    plan.write(planned, folder / "plan.parquet")
+    return [asdict(row) | {"reason": "kept" if row.wanted else "reserve_not_needed"} for row in planned]
+
+
+def write_manifest(folder: Path, rows: Rows) -> None:
+    table = pa.Table.from_pylist(rows, schema=manifest.schema())
+    settings = manifest.Settings(source="starter", replay=ReplayConfig(), render=RenderConfig())
+    manifest.write(table, folder / "manifest.parquet", settings)
+
+
+PLANNED_VALUES = {"rank": 9, "seed": 9, "demo_steps": 1, "twin_id": "other", "level": "5", "wanted": False}
+
+
+@pytest.mark.parametrize(("column", "other"), [*PLANNED_VALUES.items(), ("chosen", False)])
+def test_a_value_other_than_the_planned_one_is_found(column: str, other: object, tmp_path: Path) -> None:
+    rows = [row | {"kept": False, "chosen": True} for row in write_plan(tmp_path)]
+    write_manifest(tmp_path, rows)
+    assert list(_unlike_plan(run_in(tmp_path))) == []
+    rows[0][column] = other
+    write_manifest(tmp_path, rows)
+    (fault,) = _unlike_plan(run_in(tmp_path))
+    assert (fault.episode, fault.what) == (rows[0]["episode_id"], f"{column} is {other!r}")
+
+
+@pytest.mark.parametrize(
+    ("row_number", "column", "other"),
+    [
+        (1, "steps", 1),
+        (1, "replay_mode", "tracked"),
+        (1, "path_ratio", 99.0),
+        (1, "gl_device", "another"),
+        (3, "steps", len(MADE)),
+    ],
+    ids=["steps", "mode", "path", "device", "steps of a reserve without replay"],
+)
+def test_results_other_than_the_stored_ones_are_found_also_of_a_dropped_row(
+    row_number: int, column: str, other: object, tmp_path: Path
+) -> None:
+    rows = write_plan(tmp_path)
+    run, (trajectory_id,) = run_in(tmp_path), {row["trajectory_id"] for row in rows}
+    quality = Quality(0.0, 0.0, 0, 2.0, 0.0, 0.0, 0.0, 0.0)
+    run.trajectories.save(replace(case().trajectory, trajectory_id=trajectory_id, quality=quality))
+    streams: dict[str, Sequence[Jpeg]] = {}
+    for row in rows:
+        for view, stream in streams_of(row["perturbations"]).items():
+            streams[stream.stream_id] = MADE.frames[view]
+    motion = (MADE.state, MADE.joint_state, MADE.action, MADE.action_absolute)
+    run.frames.save(trajectory_id, Rendered("open_loop", *motion, streams), "llvmpipe")
+    for row in rows:
+        needed = row["reason"] == "kept"
+        row |= {"kept": needed, "chosen": True, "gl_device": "llvmpipe" if needed else None}
+        row |= {"steps": len(MADE), "replay_mode": "open_loop"} if needed else {"steps": None, "replay_mode": None}
+        row["path_ratio"] = 1.0 if needed else None
+    rows[1] |= {"kept": False, "reason": "goal_lost"}
+    write_manifest(tmp_path, rows)
+    assert list(_unlike_stores(run_in(tmp_path))) == []
+    rows[row_number][column] = other
+    write_manifest(tmp_path, rows)
+    (fault,) = _unlike_stores(run_in(tmp_path))
+    assert (fault.episode, fault.what) == (rows[row_number]["episode_id"], f"{column} is {other!r}")
+
+
 @pytest.mark.parametrize(
     ("plant", "what"),
     [
@@ -96,18 +178,11 @@ def lose_a_row(rows: Rows) -> None:
 def test_a_manifest_that_does_not_follow_from_the_plan_is_found(
     plant: Callable[[Rows], None] | None, what: str | None, tmp_path: Path
 ) -> None:
-    """A twin, and two noisy episodes with one in reserve."""
-    demos = [DemoEntry(BOWL, "demo_0", "test", "human", "0", steps=100)]
-    noisy = PlanConfig(seed=0, axes=Axes(noise=NoiseAxis()), episodes={"noise": 2}, reserve=0.5)
-    planned = plan.make(demos, noisy, ReplayConfig(), TestSet(()))
-    plan.write(planned, tmp_path / "plan.parquet")
-    rows = [asdict(row) | {"reason": "kept" if row.wanted else "reserve_not_needed"} for row in planned]
+    rows = write_plan(tmp_path)
     if plant is not None:
         plant(rows)
     for row in rows:
         row |= {"kept": row["reason"] == "kept", "chosen": True, "steps": 90}
-    table = pa.Table.from_pylist(rows, schema=manifest.schema())
-    settings = manifest.Settings(source="starter", replay=ReplayConfig(), render=RenderConfig())
-    manifest.write(table, tmp_path / "manifest.parquet", settings)
+    write_manifest(tmp_path, rows)
     write_json(tmp_path / "counts.json", by_axis_and_suite(rows))
     assert [fault.what for fault in _counts(run_in(tmp_path))] == ([] if what is None else [what])

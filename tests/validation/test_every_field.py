@@ -1,6 +1,7 @@
-"""Every field of ``meta/`` that a client reads is compared with what it is about: one is changed, and it is found."""
+"""Every stored field is compared with what it is about: one is changed, and it is found."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,13 +11,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from synthetic import IDS, SET, episode, write_lerobot, write_lerobot_v21, write_rlds
+from synthetic import IDS, SET, episode, records, write_lerobot, write_lerobot_v21, write_rlds
 
+from pipeline.episode_schema import labels_of
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Format
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.read_back import Fault
 from pipeline.formats.rlds import Rlds, RldsConfig
+from pipeline.formats.tfrecord import framed
+from pipeline.run.manifest import OWN_VERSION
 from pipeline.types import Scene, Trajectory, Verdict
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
@@ -62,14 +66,30 @@ def found(target: Format[Any], folder: Path) -> list[str]:
     return texts
 
 
+def found_in_first(target: Format[Any], folder: Path) -> list[str]:
+    """Return the faults of the first episode alone, which is faster."""
+    try:
+        return [fault.what for fault in of_first(target, rows(target), folder)]
+    except PipelineError as error:
+        return [str(error)]
+
+
 def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path) -> list[Fault]:
     source = episode(IDS[0])
     copy = target.read(kept[IDS[0]])
-    assert copy is not None
+    if copy is None:
+        return [Fault(target.name, IDS[0], "is not in the dataset", "every kept episode")]
     none = np.zeros((0, 0), np.float32)
-    replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), np.zeros(0), np.zeros(0), none, Verdict(True, "kept"))
-    case = Case(kept[IDS[0]], source, replay, [copy], None, witness=True)
-    return [*CHECKS["statistics"](case), *CHECKS["provenance"](case)]
+    actions = source.action.astype(float)
+    states = np.zeros((len(source) + 1, 10))
+    states[:-1, 1:8] = source.joint_state
+    replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), states, actions, none, Verdict(True, "kept"))
+    labels = labels_of(source)
+    row = {**kept[IDS[0]], **labels, "rewrites": json.dumps(labels["rewrites"]), "kept": True}
+    case = Case({**row, "instruction": source.instruction}, source, replay, [copy], None, witness=True)
+    names = ("length", "motion", "instruction", "labels", "provenance", "place", "jpeg", "geometry", "flags", "clock")
+    faults = [fault for name in ("statistics", *names) for fault in CHECKS[name](case)]
+    return [fault for fault in faults if fault.dataset == target.name]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -183,6 +203,8 @@ def leaves(value: Any, at: Path_ = ()) -> Iterator[Path_]:
 def another(value: Any) -> Any:
     if isinstance(value, bool):
         return not value
+    if isinstance(value, list):
+        return [another(value[0]), *value[1:]]
     if isinstance(value, str):
         return str(int(value) + 1) if value.isdigit() else f"{value}x"
     return "x" if value is None else value + 1
@@ -214,6 +236,59 @@ def test_every_value_counts(name: str, file: str, written: Path, tmp_path: Path)
             passed.append(place)
         path.write_text(text)
     assert passed == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("lerobot", "meta/provenance.parquet"),
+        ("lerobot", "data/chunk-000/file-000.parquet"),
+        ("lerobot_v21", "meta/provenance.parquet"),
+        ("lerobot_v21", "data/chunk-000/episode_000000.parquet"),
+    ],
+)
+def test_every_column_counts(name: str, file: str, written: Path, tmp_path: Path) -> None:
+    """Changed at the first episode or step, one after another, each is found."""
+    target = opened(name, written, tmp_path)
+    path = target.folder / NAMES[name] / file
+    # The version of this project is for information only.
+    columns = [column for column in pq.read_schema(path).names if column != OWN_VERSION]
+    content = path.read_bytes()
+    assert len(columns) >= 9
+    passed = []
+    for number, column in enumerate(columns):
+        spoil_table(path, column, another)
+        # Readers keep the tables of meta/ until info.json changes.
+        os.utime(target.folder / NAMES[name] / "meta" / "info.json", ns=(number, number))
+        if not (found_in_first(target, tmp_path) or found(target, tmp_path)):
+            passed.append(column)
+        path.write_bytes(content)
+    assert passed == []
+
+
+@pytest.mark.parametrize("name", ["lerobot_v21"])
+def test_a_provenance_of_episodes_in_another_order_is_found(name: str, written: Path, tmp_path: Path) -> None:
+    target = opened(name, written, tmp_path)
+    path = target.folder / NAMES[name] / "meta" / "provenance.parquet"
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("episode_index")
+    reversed_indices = pa.array(table["episode_index"].to_pylist()[::-1], pa.int64())
+    pq.write_table(table.set_column(place, table.schema.field(place), reversed_indices), path)
+    assert any("episode_index of provenance.parquet is [5, 4" in text for text in found(target, tmp_path))
+
+
+def test_a_changed_path_of_the_demonstration_in_rlds_is_found(written: Path, tmp_path: Path) -> None:
+    target = opened("rlds", written, tmp_path)
+    path = f"demo_source of {IDS[0]}"
+    for shard in target.folder.rglob("*.tfrecord-*"):
+        changed_records = []
+        for record in records(shard):
+            before, name, after = record.partition(b"episode_metadata/file_path")
+            # The same value is also stored as demo_source.
+            changed_records.append(before + name + after.replace(path.encode(), b"x" * len(path), 1))
+        shard.write_bytes(b"".join(map(framed, changed_records)))
+    assert found(target, tmp_path) == [f"file_path is '{'x' * len(path)}'"]
 
 
 @pytest.mark.parametrize("name", ["lerobot", "rlds"])

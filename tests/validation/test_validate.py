@@ -127,6 +127,7 @@ EXPECTED = {
     ("format", "lerobot", None),  # 10 frames a second, says info.json.
     ("place", "manifest", "other"),
     ("wording", "manifest", "other"),
+    ("plan", "manifest", "other"),  # Its instruction is not the planned one.
     ("instruction", "rlds", "other"),
     ("instruction", "lerobot", "other"),
     ("counts", "manifest", None),  # counts.json has one camera episode more.

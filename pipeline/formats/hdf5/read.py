@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.hdf5 import layout
+from pipeline.formats.hdf5.write import REPEATED
 from pipeline.formats.read_back import Copy, Fault, in_both_splits, sampled, subtasks_of, unlike
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero import hdf5
@@ -125,6 +126,24 @@ def _wrong_file(file: Path, opened: h5py.File, demos: Mapping[str, str], content
         yield from unlike(FORMAT, {"arrays": found}, {"arrays": arrays}, f"{name} {demo}: ")
         if not np.array_equal(group.attrs["init_state"], group["states"][0]):
             yield Fault(FORMAT, demos[demo], "init_state differs from the first state", "the first state")
+        if found == arrays:
+            yield from _wrong_copies(group, demos[demo])
+
+
+SAME_STATE = 1e-9
+"""Largest difference of entries of ``robot_states`` between processors, in m and parts of a quaternion."""
+
+
+def _wrong_copies(group: h5py.Group, episode_id: str) -> Iterator[Fault]:
+    """Compare LIBERO's arrays that repeat the pose of the hand and the fingers with the arrays that ``read`` reads."""
+    obs = group["obs"]
+    position, orientation, fingers = (obs[name][()] for name in ("ee_pos", "ee_ori", "gripper_states"))
+    if not np.array_equal(obs["ee_states"], np.hstack([position, orientation])):
+        yield Fault(FORMAT, episode_id, "obs/ee_states differs from obs/ee_pos and obs/ee_ori", "the same numbers")
+    expected = np.hstack([fingers, position, layout.quaternions(orientation)])
+    if not np.allclose(group["robot_states"], expected, rtol=0, atol=SAME_STATE):
+        what = "robot_states differs from obs/gripper_states, obs/ee_pos and obs/ee_ori"
+        yield Fault(FORMAT, episode_id, what, "the same numbers, the orientation as a quaternion")
 
 
 def _arrays(steps: int, numbers: int, content: Content) -> dict[str, str]:
@@ -161,7 +180,15 @@ def read(root: Path, episode_id: str, content: Content) -> Copy | None:
     if place is None:
         return None
     with _readable(f"{place.file} data/{place.demo}"), hdf5.opened(place.file) as opened:
-        return _copy(opened[f"data/{place.demo}"], content, _split_of(root, place.file) == "train")
+        return _copy(place, opened[f"data/{place.demo}"], content, _split_of(root, place.file) == "train")
+
+
+def _frames(place: Place, view: str) -> Iterator[Frame]:
+    """Yield the frames of a view of an episode, rotated as in an ``Episode``, with one frame at a time in memory."""
+    name = f"data/{place.demo}/{layout.frames_key(view)}"
+    with _readable(f"{place.file} {name}"), hdf5.opened(place.file) as opened:
+        for frame in opened[name]:
+            yield to_policy(frame)
 
 
 @lru_cache(maxsize=1)
@@ -173,7 +200,7 @@ def _places(files: tuple[Edition, ...]) -> dict[str, Place]:
     return places
 
 
-def _copy(group: h5py.Group, content: Content, train: bool) -> Copy:
+def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Copy:
     attributes = dict(group.attrs)
     obs, actions = group["obs"], group["actions"][()]
     state = np.hstack([obs["ee_pos"][()], obs["ee_ori"][()], obs["gripper_states"][()]])
@@ -209,7 +236,8 @@ def _copy(group: h5py.Group, content: Content, train: bool) -> Copy:
         marks={name: group[array][()] for name, array in MARKS.items()},
         place={},
         train=train,
-        lossless=True,
+        lossless_frames=partial(_frames, place),
+        repeated={name: (column, str(attributes[name])) for name, column in REPEATED.items()},
     )
 
 

@@ -18,6 +18,13 @@ from pipeline.images.jpeg import decode, decode_exactly, to_policy
 from pipeline.libero import hdf5
 from pipeline.types import Episode, Replay
 
+REPEATED = {hdf5.EXPANDED_FROM: "demo_id", hdf5.EXPANDED_FROM_SHA256: "demo_sha256"}
+"""Attributes with the names of ``demos expand``, to the column of the provenance that they repeat.
+
+They mark an episode as generated, so that a run that reads the file as demonstrations knows the human demonstration
+behind it.
+"""
+
 
 def write_file(path: Path, piece: Piece, load: Load, content: Content) -> None:
     """Write the episodes of one task.
@@ -86,17 +93,10 @@ def _images(episode: Episode, content: Content) -> dict[str, NDArray[Any]]:
 
 
 def _attributes(episode: Episode, content: Content) -> dict[str, Any]:
-    """Return the labels of an episode.
-
-    The names of ``demos expand`` mark it as generated, so that a run that reads the file as demonstrations knows the
-    human demonstration behind it.
-    """
+    """Return the labels of an episode."""
     stated = episode.provenance
-    attributes: dict[str, Any] = {
-        hdf5.EXPANDED_FROM: stated["demo_id"],
-        hdf5.EXPANDED_FROM_SHA256: stated["demo_sha256"],
-        "instruction": episode.instruction,
-    }
+    attributes: dict[str, Any] = {name: stated[column] for name, column in REPEATED.items()}
+    attributes["instruction"] = episode.instruction
     for name, kind in content.provenance.items():
         attributes[name] = np.float32(stated[name]) if kind == "float32" else stated[name]
     for view, geometry in episode.geometry.items():

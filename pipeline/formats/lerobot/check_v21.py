@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Row
@@ -90,6 +91,9 @@ def _format(root: Path, layout: Layout) -> Iterator[Fault]:
     read = {"fields of info.json": sorted(info), "files": sorted(existing), "episodes with statistics": stated}
     expected = {"fields of info.json": sorted(wanted), "files": sorted(files), "episodes with statistics": indices}
     yield from unlike(dataset, read, expected, within)
+    table = pq.read_table(root / "meta" / "provenance.parquet", columns=["episode_index"])
+    name = "episode_index of provenance.parquet"
+    yield from unlike(dataset, {name: table["episode_index"].to_pylist()}, {name: [*range(len(rows))]}, within)
     lines = read_lines(root / "meta" / "episodes.jsonl")
     read = {"episode_index": [line.get("episode_index") for line in lines]}
     read["fields of episodes.jsonl"] = sorted({tuple(sorted(line)) for line in lines})
