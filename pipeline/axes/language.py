@@ -28,6 +28,7 @@ from pipeline.axes.language_copies import copies_test
 from pipeline.axes.language_lint import CLASSES, LENGTH, NAMED, REMEDY, Component, lint, normalise
 from pipeline.axes.report_data import BENCHMARK, CoveragePlots, Histogram, KeptPerturbation, ObservedEpisode, Strips
 from pipeline.errors import PipelineError
+from pipeline.grouping import grouped
 from pipeline.jit import compiled
 from pipeline.libero.tasks import Same, find_task
 from pipeline.strict_yaml import FastStrictLoader
@@ -269,13 +270,14 @@ def list_rewrites(
     rewrites = _find_rewrites(task, classes, levels, bank)
     if rewrites:
         return rewrites
-    of_class = {component: len(texts) for component, texts in _stored(task, bank).items() if texts}
-    if of_class:
+    others = _find_rewrites(task, CLASSES, get_args(Level), bank)
+    if others:
+        levels_of = grouped((rewrite.component, rewrite.level) for rewrite in others)
+        existing = [f"{name} at {', '.join(map(str, sorted({*found})))}" for name, found in levels_of.items()]
         raise PipelineError(
             f"task {task} has no rewrites of class {' or '.join(classes)} at level {' or '.join(map(str, levels))}",
             where="plan.axes.language",
-            expected="classes and levels of its rewrites: "
-            + ", ".join(f"{number} {component}" for component, number in of_class.items()),
+            expected=f"classes and levels of its rewrites: {'; '.join(existing)}",
             remedy="add levels or components to plan.axes.language, or add such rewrites to a bank of your own",
         )
     raise PipelineError(

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Annotated, ClassVar, Literal, TypeVar, get_args
 
-import cv2
 import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
@@ -120,6 +119,8 @@ class NoisePerturbation(PixelPerturbation):
 
 def _resized(frame: Frame, height: int, width: int) -> Frame:
     """Resize a frame (H, W, 3): smaller by the mean of the covered pixels, larger linearly."""
+    import cv2  # takes long, and every process of a run imports the axes
+
     is_smaller = height * width < frame.shape[0] * frame.shape[1]
     return np.asarray(
         cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR), np.uint8

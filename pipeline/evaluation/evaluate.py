@@ -49,7 +49,7 @@ SCENE_S, STEP_S = 1800.0, 120.0
 def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers: int = 1) -> dict[str, Any]:
     """Run the selected episodes that have no result yet.
 
-    ``summary.json`` and ``episodes.csv`` are of all selected episodes.
+    ``summary.json`` is of all selected episodes, and ``episodes.csv`` of all episodes of the policy in the folder.
     If the policy gives no action, its episode has no result, and the evaluation resumes with the next episode.
 
     Args:
@@ -98,7 +98,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
     }
     write_json(evaluation.folder / "summary.json", summarised)
-    evaluation.files.write_table(rows)
+    evaluation.files.write_table(evaluation.results())
     if faults:
         raise _without_result([*faults.items()])
     return summarised

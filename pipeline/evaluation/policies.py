@@ -4,7 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
-from importlib.util import find_spec
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -14,7 +14,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import Actions, PolicyError, checked_actions, reject_other_actions
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import checksum
+from pipeline.files import checksum, read_json
 from pipeline.images.jpeg import resized
 from pipeline.seeding import digest
 from pipeline.types import Floats
@@ -383,7 +383,7 @@ class Checkpoint:
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
         self.name, self._torch = str(folder), torch
-        config = PreTrainedConfig.from_pretrained(folder)
+        config = _config_of(folder, PreTrainedConfig)
         config.pretrained_path = folder
         if config.device is None or (config.device.startswith("cuda") and not torch.cuda.is_available()):
             config.device = "cpu"
@@ -392,16 +392,9 @@ class Checkpoint:
             self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
         except (ImportError, TypeError) as error:
             # lerobot's policies replace the names of a missing package by None, which then cannot be called.
-            if isinstance(error, TypeError) and find_spec("transformers"):
+            if isinstance(error, TypeError) and "NoneType" not in str(error):
                 raise
-            raise PipelineError(
-                f"lerobot cannot load a policy of the type {config.type}: {error}",
-                where=folder,
-                expected=f"the packages that lerobot's {config.type} needs, such as transformers",
-                remedy="install these packages here, or serve the policy from the environment that trained it: "
-                f"`python -m vla_eval.model_servers.lerobot --args.policy_type {config.type} --args.checkpoint "
-                f"{folder}`, then `evaluate --server`",
-            ) from error
+            raise _cannot_load(folder, config.type, str(error), "the packages that the policy needs") from error
         _reject_other_weights(self._policy.state_dict(), weights)
         self._policy.eval()
         self._before, self._after = make_pre_post_processors(
@@ -438,6 +431,31 @@ class Checkpoint:
 
     def end(self, success: bool) -> None:
         """End the episode, without effect on the policy."""
+
+
+def _config_of(folder: Path, configs: Any) -> Any:
+    """Read lerobot's configuration of a policy; ``configs`` is its base class.
+
+    Raises:
+        PipelineError: if the installed lerobot does not have this type of policy.
+    """
+    kind = str(read_json(folder / "config.json", "name a folder that lerobot saved a policy in").get("type"))
+    if kind not in configs.get_known_choices():
+        installed = f"lerobot {version('lerobot')} has no policy of this type"
+        raise _cannot_load(folder, kind, installed, "a policy of the installed lerobot")
+    return configs.from_pretrained(folder)
+
+
+def _cannot_load(folder: Path, kind: str, what: str, expected: str) -> PipelineError:
+    """Return the error about a policy that this environment cannot load, and another one can serve."""
+    return PipelineError(
+        f"lerobot cannot load a policy of the type {kind}: {what}",
+        where=folder,
+        expected=expected,
+        remedy="serve the policy from the environment that trained it, after `pip install vla-eval==0.8.0` there: "
+        f"`python -m vla_eval.model_servers.lerobot --args.policy_type {kind} --args.checkpoint {folder} "
+        "--args.chunk_size N`, then `evaluate --server ... --look-every N --state-angle 2pi`",
+    )
 
 
 COMPARED_TENSORS = 20

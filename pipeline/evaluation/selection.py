@@ -62,7 +62,7 @@ class Selection(Frozen, use_attribute_docstrings=True):
     axes: tuple[str, ...] = ()
     """only these axes, which ``python -m pipeline axes`` lists"""
     components: tuple[ComponentName, ...] = ()
-    """only these components, the kinds of an axis in the same list"""
+    """only these components, which the same command lists"""
     levels: tuple[int, ...] = ()
     """only these levels, 1 to 5"""
     tasks: tuple[str, ...] = ()

@@ -282,9 +282,9 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     if without:
         none = f"{len(without)} of {len(counts)} tasks have no demonstration under {root}, such as {without[0]}"
         remedy = (
-            f"download LIBERO's with `python -m pipeline demos fetch {root} SUITE`, or generate some with "
-            f"`python -m pipeline demos expand {root} --per-task 50`; or set demos.root and demos.tasks to your "
-            "folder and its tasks"
+            f"download LIBERO's with `python -m pipeline demos fetch {root} SUITE`, or generate some of its tasks with "
+            f"`python -m pipeline demos expand {root} --per-task 50 --tasks {without[0]}`; or set demos.root and "
+            "demos.tasks to your folder and its tasks"
         )
         return Diagnosis("demos", "fail", none, remedy)
     detail = f"{sum(counts.values())} demonstrations of {len(counts)} tasks under {root}"

@@ -277,8 +277,10 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path, e
     assert rows(alone) == rows(begun)
     found = json.loads((begun / "summary.json").read_text())
     assert found["all"]["successes"] == found["all"]["episodes"] == 2
+    evaluate_here(begun, "--replay")  # one of the two again, which runs nothing
+    assert json.loads((begun / "summary.json").read_text())["all"]["episodes"] == 1
     table = pd.read_csv(begun / "episodes.csv", index_col="episode")
-    assert {*table.index} == rows(begun).keys()
+    assert {*table.index} == rows(begun).keys(), "the episodes of both calls"
     for episode, row in rows(begun).items():
         columns = ("source", "suite", "name", "axis", "level", "number", "success", "reason", "steps")
         assert {column: table.loc[episode, column] for column in columns} == {column: row[column] for column in columns}

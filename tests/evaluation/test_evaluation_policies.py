@@ -148,13 +148,20 @@ def test_a_checkpoint_whose_packages_are_missing_is_named_with_the_server_that_h
     config: type[SmolVLAConfig | PI05Config], tmp_path: Path
 ) -> None:
     """The project installs lerobot without transformers, which both policies need."""
-    assert find_spec("transformers") is None
+    assert find_spec("transformers") is None, "the tests are of the locked packages"
     kind = config(input_features=images(image=32, image2=32), device="cpu")
     kind._save_pretrained(tmp_path)
     (tmp_path / "model.safetensors").touch()
     with pytest.raises(PipelineError, match=f"cannot load a policy of the type {kind.type}") as found:
         Checkpoint(tmp_path)
     assert f"vla_eval.model_servers.lerobot --args.policy_type {kind.type} --args.checkpoint" in str(found.value)
+
+
+def test_a_checkpoint_of_a_policy_that_lerobot_does_not_have_is_named(tmp_path: Path) -> None:
+    """Such as MolmoAct2 of lerobot 0.6.1 under 0.4.4."""
+    (tmp_path / "config.json").write_text('{"type": "policy_of_tomorrow"}')
+    with pytest.raises(PipelineError, match=r"policy_of_tomorrow: lerobot [\d.]+ has no policy of this type"):
+        Checkpoint(tmp_path)
 
 
 @pytest.mark.parametrize(("least", "warnings"), [(-1.0, 0), (0.0, 1)])
