@@ -13,6 +13,7 @@ from pipeline.axes.language import load_bank
 from pipeline.axes.language_lint import lint
 from pipeline.libero import bddl
 from pipeline.libero.tasks import SUITES, tasks
+from pipeline.machine_code import ensure_fixed_machine_code
 
 
 def main() -> None:
@@ -39,4 +40,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    ensure_fixed_machine_code()
     main()

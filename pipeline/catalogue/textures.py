@@ -59,12 +59,8 @@ TESTED_NAME = "it has the name of an image that test tasks show"
 
 @cache
 def normalise(name: str) -> str:
-    """Normalise the name of an image file for comparisons.
-
-    Folders, ending, case, kind of separator and a resolution at the end (``_2K``, ``_HIRES``) are removed.
-    """
+    """Normalise the name of an image file for comparisons: remove folders, ending, case and kind of separator."""
     stem = re.sub(r"\.(png|jpe?g)$", "", re.split(r"[/\\:]", name)[-1], flags=re.IGNORECASE)
-    stem = re.sub(r"[-_ ](\d+k|hires|lowres)$", "", stem, flags=re.IGNORECASE)
     return re.sub(r"[^a-z0-9]+", "-", stem.lower()).strip("-")
 
 

@@ -84,6 +84,10 @@ def at(place: int) -> float:
 def ends(name: str, config: dict[str, Any], path: Path, value: Any) -> Iterator[dict[str, Any]]:
     """Configurations of an axis with one field at the least and at the greatest that is accepted."""
 
+    # An interval alone, as intervals may not overlap.
+    if isinstance(value, list):
+        config, path = changed(config, path[:-1], [value]), (*path[:-1], 0)
+
     def accepts(number: Any) -> bool:
         try:
             Axes.model_validate({name: changed(config, path, [number] * 2 if isinstance(value, list) else number)})

@@ -118,9 +118,6 @@ def test_test_images_are_rejected_by_content_and_name_and_data_maps_by_name() ->
     used = (LIBERO / "light-gray-plaster.png").read_bytes()
     assert "bytes" in str(why_rejected("mine.png", hashlib.sha256(used).hexdigest()))
     assert "name" in str(why_rejected("folder:somewhere/Gray-Plaster.JPG", "0" * 64))
-    for resolution in ("HIRES", "3K", "1k"):
-        name = f"FabricLeatherCrocodile001_COL_VAR2_{resolution}.png"
-        assert "name" in str(why_rejected(name, "0" * 64)), "an image of the test set at another resolution"
     for name in ("Bricks02_NRM_6K.png", "Wood_DISP.png", "metal-roughness.jpg", "CliffDesert006_AO_HIRES.png"):
         assert "colour" in str(why_rejected(name, "0" * 64))
     for name in ("Bricks02_COL_6K.png", "normandy_stone.png", "special-oak.png"):

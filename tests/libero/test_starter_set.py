@@ -7,6 +7,7 @@ import pytest
 from recordings import NAME, TASK, run
 
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import package_folder
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import select_tasks, tasks
 
@@ -54,6 +55,7 @@ def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatc
         ):
             StarterSource().index([TASK])
     monkeypatch.setattr("pipeline.libero.assets.find_spec", lambda _: None)
+    package_folder.cache_clear()
     with pytest.raises(PipelineError, match=r"robouse is not installed\n  try: mv \.venv \.venv\.old && bash setup"):
         StarterSource().index([TASK])
 

@@ -20,6 +20,7 @@ from stand_in_hub import ATTRIBUTES, REPOSITORY, Hub, is_large
 from synthetic import SET, write_lerobot
 from validated_run import NAME, RUN, prepare, write_card, write_run
 
+from pipeline.config import load
 from pipeline.episode_schema import STANDARD
 from pipeline.errors import PipelineError
 from pipeline.formats.lerobot import check
@@ -350,6 +351,7 @@ def test_the_command_says_all_of_it_and_sends_it_when_asked(hub: Hub, data: Path
         "export": {"rlds": None, "lerobot": {"name": NAME, "shards": 3}},
     }
     config.write_text(yaml.safe_dump(content))
+    write_card(data, config=load(config))
     environment = {**os.environ, "HF_ENDPOINT": hub.endpoint, "HF_HUB_DISABLE_XET": "1"}
 
     def push(*options: str) -> subprocess.CompletedProcess[str]:

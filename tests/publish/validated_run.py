@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 from conftest import run_in
 from synthetic import write_lerobot, write_lerobot_v21, write_rlds
 
+from pipeline.config import Config
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum
 from pipeline.formats.lerobot import LeRobotConfig, LeRobotV21Config
@@ -52,9 +53,9 @@ def write_run(data: Path) -> None:
     write_card(data)
 
 
-def write_card(data: Path, *, checksums: bool = False) -> None:
+def write_card(data: Path, *, checksums: bool = False, config: Config | None = None) -> None:
     made_from = {name: checksum(data / name) for name in ("manifest.parquet", *REPORTS)}
-    with generated(data / "card", made_from, published_settings(run_in(data).config)) as card:
+    with generated(data / "card", made_from, published_settings(config or run_in(data).config)) as card:
         for kind in ("rlds", "lerobot", "lerobot_v21"):
             (card / kind / "pictures").mkdir(parents=True)
             (card / kind / "README.md").write_text(f"---\nlicense: mit\n---\n{kind}: hf download OWNER/NAME\n")

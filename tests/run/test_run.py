@@ -360,9 +360,9 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(
             {"name": "tiny", "convention": "ipec"},
             {"exports", "manifest", "validate", "recipe", "card", "report"},
         ),
-        (("render", "jpeg_quality"), 90, {"render", "report"}),
+        (("render", "jpeg_quality"), 90, {"render", "summary", "card", "report"}),
         (("compute", "workers"), 5, set()),
-        (("plan", "seed"), 8, {"plan", "summary", "report"}),
+        (("plan", "seed"), 8, {"plan", "summary", "card", "report"}),
         # What is written out as the default is, is no change.
         (("replay", "noops"), "drop", set()),
     ]
