@@ -49,7 +49,8 @@ SCENE_S, STEP_S = 1800.0, 120.0
 def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers: int = 1) -> dict[str, Any]:
     """Run the selected episodes that have no result yet.
 
-    ``summary.json`` is of all selected episodes, and ``episodes.csv`` of all episodes of the policy in the folder.
+    ``summary.json`` is of all selected episodes, and ``episodes.csv`` of all episodes of the policy in the folder
+    that have their settings.
     If the policy gives no action, its episode has no result, and the evaluation resumes with the next episode.
 
     Args:
@@ -98,7 +99,9 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
     }
     write_json(evaluation.folder / "summary.json", summarised)
-    evaluation.files.write_table(evaluation.results())
+    # Other calls have written results of other tasks.
+    alike = [row for row in evaluation.files.rows() if rows and row.identity == evaluation.identity]
+    evaluation.files.write_table(row for row in alike if row.settings == rows[0].settings)
     if faults:
         raise _without_result([*faults.items()])
     return summarised

@@ -139,19 +139,6 @@ class Evaluation:
         row = self.files.row(self.episode(task))
         return row if row is not None and _record(row).matches(self.basis(task)) else None
 
-    def results(self) -> list[EpisodeResult]:
-        """Read the up-to-date results of this policy under these settings, of any selection.
-
-        Raises:
-            PipelineError: if a file is not a result of this version.
-        """
-        results: list[EpisodeResult] = []
-        for row in self.files.rows():
-            task, *_ = row.trial
-            if row.episode == self.episode(task) and _record(row).matches(self.basis(task)):
-                results.append(row)
-        return results
-
     def test_results(self) -> list[EpisodeResult]:
         """Read the up-to-date results on test tasks of this policy under these settings, of any selection.
 
@@ -159,7 +146,13 @@ class Evaluation:
             PipelineError: if a file is not a result of this version, or if the policy used other views or states in
                 some of the results.
         """
-        results = [row for row in self.results() if row.source == "libero_plus"]
+        results: list[EpisodeResult] = []
+        for row in self.files.rows():
+            if row.source != "libero_plus":
+                continue
+            task, *_ = row.trial
+            if row.episode == self.episode(task) and _record(row).matches(self.basis(task)):
+                results.append(row)
         one_setting([(row, self.files) for row in results])
         return results
 
