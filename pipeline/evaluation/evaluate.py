@@ -99,9 +99,10 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
     }
     write_json(evaluation.folder / "summary.json", summarised)
-    # Other calls have written results of other tasks.
-    alike = [row for row in evaluation.files.rows() if rows and row.identity == evaluation.identity]
-    evaluation.files.write_table(row for row in alike if row.settings == rows[0].settings)
+    # Other calls have written results of other tasks; equal settings are those of this call's results.
+    settings_here = [row.settings for row in rows[:1]]
+    in_folder = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]
+    evaluation.files.write_table(row for row in in_folder if row.settings in settings_here)
     if faults:
         raise _without_result([*faults.items()])
     return summarised

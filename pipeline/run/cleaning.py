@@ -123,7 +123,7 @@ def delete(run: Run, parts: Iterable[str]) -> None:
         chosen = [*parts]
         reject_foreign(run, chosen)
         # Unfinished files come last, as they include records of datasets that other parts delete.
-        for part in sorted(chosen, key=UNFINISHED.__eq__):
+        for part in sorted(chosen, key=lambda part: part == UNFINISHED):
             for path in map(run.path, PARTS[part].names):
                 if part == UNFINISHED:
                     keep_below(path, put_away_records(path))

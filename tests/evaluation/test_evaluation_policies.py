@@ -150,7 +150,7 @@ def test_a_checkpoint_whose_packages_are_missing_is_named_with_the_server_that_h
     """The project installs lerobot without transformers, which both policies need."""
     assert find_spec("transformers") is None, "the tests are of the locked packages"
     kind = config(input_features=images(image=32, image2=32), device="cpu")
-    kind._save_pretrained(tmp_path)
+    kind.save_pretrained(tmp_path)
     (tmp_path / "model.safetensors").touch()
     with pytest.raises(PipelineError, match=f"cannot load a policy of the type {kind.type}") as found:
         Checkpoint(tmp_path)
