@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tensorflow_datasets as tfds
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
@@ -26,7 +25,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats import exact_statistics
 from pipeline.formats.rlds_layout import datasets
-from pipeline.formats.tfrecord import METADATA, columns, records
+from pipeline.formats.tfrecord import METADATA, columns, info_of, records
 
 CHUNK = 8
 """Actions that OFT predicts at once on LIBERO: the current one and seven to come."""
@@ -86,7 +85,7 @@ def read(folder: Path) -> Iterator[Recorded]:
     Raises:
         PipelineError: if a checksum is wrong or a feature that OFT reads is missing; it names the file and the record.
     """
-    features = tfds.builder_from_directory(folder).info.features
+    features = info_of(folder).features
     for shard in sorted(folder.glob("*.tfrecord-*")):
         for index, record in enumerate(records(shard)):
             stored = columns(record, features)

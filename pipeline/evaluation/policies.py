@@ -370,8 +370,8 @@ class Checkpoint:
         folder: folder with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
 
     Raises:
-        PipelineError: if the policy wants an image that the tasks do not have, if its weights were not loaded, or if
-            its packages are missing.
+        PipelineError: if the policy wants an image that the tasks do not have, if its weights were not loaded, if its
+            packages are missing, or if its folder names code of other packages.
     """
 
     wanted = Wanted()
@@ -397,6 +397,7 @@ class Checkpoint:
             raise _cannot_load(folder, config.type, str(error), "the packages that the policy needs") from error
         _reject_other_weights(self._policy.state_dict(), weights)
         self._policy.eval()
+        _reject_foreign_steps(folder)
         self._before, self._after = make_pre_post_processors(
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
         )
@@ -456,6 +457,20 @@ def _cannot_load(folder: Path, kind: str, what: str, expected: str) -> PipelineE
         f"`python -m vla_eval.model_servers.lerobot --args.policy_type {kind} --args.checkpoint {folder} "
         "--args.chunk_size N`, then `evaluate --server ... --look-every N --state-angle 2pi`",
     )
+
+
+def _reject_foreign_steps(folder: Path) -> None:
+    """Raise a ``PipelineError`` if a checkpoint names a foreign step, which lerobot would import and call."""
+    for file in sorted(folder.glob("policy_*processor.json")):
+        for step in read_json(file, "name a folder that lerobot saved a policy in").get("steps", []):
+            name = step.get("class", "")
+            if "registry_name" not in step and not name.startswith("lerobot."):
+                raise PipelineError(
+                    f"a step of the policy is the class {name!r}, which lerobot would import and call",
+                    where=file,
+                    expected="steps of lerobot",
+                    remedy="if you trust this code, serve the policy (docs/model-server.md)",
+                )
 
 
 COMPARED_TENSORS = 20

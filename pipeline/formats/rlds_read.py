@@ -6,7 +6,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import tensorflow_datasets as tfds
 from google.protobuf import json_format
 
 from pipeline.episode_schema import MATRICES, SCHEMA, Content
@@ -17,7 +16,7 @@ from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of,
 from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.rlds_write import texts as rlds_texts
-from pipeline.formats.tfrecord import METADATA, OVERHEAD_BYTES, columns, record_at, records, spans
+from pipeline.formats.tfrecord import METADATA, OVERHEAD_BYTES, columns, info_of, record_at, records, spans
 from pipeline.types import Episode, Geometry
 
 MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")
@@ -191,7 +190,7 @@ def _info(folder: Path) -> Any:
 
 @lru_cache(maxsize=8)
 def _opened(info_file: Edition) -> Any:
-    info = tfds.builder_from_directory(info_file.path.parent).info
+    info = info_of(info_file.path.parent)
     _lengths(info)  # Raises if the names of the shards do not follow from the stated ones.
     return info
 

@@ -1,5 +1,6 @@
 """TFRecord files without TensorFlow: the framing of records, and examples as flat columns."""
 
+import json
 import struct
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
@@ -17,6 +18,9 @@ from pipeline.errors import PipelineError
 METADATA = "episode_metadata/"
 """Prefix of columns with one value for the whole episode."""
 
+
+FEATURE_CLASSES = "tensorflow_datasets.core.features."
+"""Start of the names of TFDS's own classes of features."""
 
 OVERHEAD_BYTES = 16
 """Bytes that the framing adds to a record."""
@@ -88,6 +92,40 @@ def _damaged(shard: Path, index: int) -> PipelineError:
     return PipelineError(
         f"record {index} is damaged", where=shard, expected="its checksum", remedy="write the dataset again"
     )
+
+
+def info_of(folder: Path) -> Any:
+    """Open the description of an RLDS dataset, ``folder`` being that of its version.
+
+    Returns:
+        A ``tfds.core.DatasetInfo``.
+
+    Raises:
+        PipelineError: if ``features.json`` names a class that is not TFDS's own. TFDS would import its module, which
+            may be a file of the dataset.
+        OSError, ValueError: if a file is missing or damaged, as TFDS raises them.
+    """
+    file = folder / "features.json"
+    for name in _classes_in(json.loads(file.read_text())):
+        if not name.startswith(FEATURE_CLASSES):
+            raise PipelineError(
+                f"a feature has the class {name!r}, whose module would be imported",
+                where=file,
+                expected=f"classes of TFDS, {FEATURE_CLASSES}*",
+            )
+    return tfds.builder_from_directory(folder).info
+
+
+def _classes_in(content: Any) -> Iterator[str]:
+    """Yield the names of classes at any depth of the content of ``features.json``."""
+    if isinstance(content, list):
+        for value in content:
+            yield from _classes_in(value)
+    if isinstance(content, dict):
+        for name, value in content.items():
+            if name in ("pythonClassName", "type") and isinstance(value, str):  # earlier versions wrote `type`
+                yield value
+            yield from _classes_in(value)
 
 
 def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -307,6 +308,7 @@ def parse(text: str, where: object) -> Bddl:
                 expected=expected,
                 remedy="remove them; a section without content is written as `(:fixtures)`",
             )
+        _reject_expressions(tokens, where)
         _, (_, problem), *rest = tokens
         sections: dict[str, Any] = {name: content for name, *content in rest}
         definition = Bddl(
@@ -372,6 +374,24 @@ def _section_with_empty(tokens: list[Any]) -> str | None:
 def _has_empty(expression: list[Any]) -> bool:
     """Return whether an expression contains an empty expression at any depth."""
     return any(isinstance(part, list) and (part == [] or _has_empty(part)) for part in expression)
+
+
+def _reject_expressions(tokens: list[Any], where: object) -> None:
+    """Raise a ``PipelineError`` if a yaw is not a number, because LIBERO evaluates it as Python code."""
+    for part in tokens:
+        if not isinstance(part, list):
+            continue
+        if part[0] == ":yaw_rotation":
+            for value in chain.from_iterable(part[1]):
+                try:
+                    float(value)
+                except ValueError as error:
+                    raise PipelineError(
+                        f":yaw_rotation has {value!r}, and LIBERO would run it as Python code",
+                        where=where,
+                        expected="two numbers in radians, such as (:yaw_rotation ((0.0 1.57)))",
+                    ) from error
+        _reject_expressions(part, where)
 
 
 def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:

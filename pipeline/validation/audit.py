@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-import tensorflow_datasets as tfds
 
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
@@ -26,7 +25,7 @@ from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats.lerobot.columns import EPISODE_ID, camera_column
-from pipeline.formats.tfrecord import METADATA, columns, records
+from pipeline.formats.tfrecord import METADATA, columns, info_of, records
 from pipeline.libero import bddl
 from pipeline.libero.arenas import ARENAS
 from pipeline.libero.tasks import SUITES, find_task, tasks
@@ -157,7 +156,7 @@ def _visible_files(folder: Path, name: str) -> list[Path]:
 
 
 def _rlds(folder: Path) -> Iterator[StoredEpisode]:
-    features = tfds.builder_from_directory(folder).info.features
+    features = info_of(folder).features
     for shard in sorted(folder.glob("*.tfrecord*")):
         for number, record in enumerate(records(shard)):
             step = columns(record, features)

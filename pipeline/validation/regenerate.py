@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
 from pipeline import gl
@@ -20,7 +19,7 @@ from pipeline.errors import PipelineError
 from pipeline.formats.base import Row
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.rlds import Rlds, RldsConfig
-from pipeline.formats.tfrecord import METADATA, columns, record_at
+from pipeline.formats.tfrecord import METADATA, columns, info_of, record_at
 from pipeline.identity import versions
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
@@ -94,7 +93,7 @@ def _record(shard: Path, index: int) -> _Record:
         raise PipelineError(
             f"the shard has no record {index}", where=shard, expected="the records that the manifest names"
         )
-    return data, columns(data, tfds.builder_from_directory(shard.parent).info.features)
+    return data, columns(data, info_of(shard.parent).features)
 
 
 def _plan_row(row: Row) -> plan.Row:

@@ -143,6 +143,21 @@ def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_rejected(
         Checkpoint(folder)
 
 
+def test_a_checkpoint_that_names_code_of_other_packages_is_rejected_before_it_runs(tmp_path: Path) -> None:
+    """lerobot imports and calls the classes that a checkpoint names."""
+    folder, ran = checkpoints.save(tmp_path, 0.25), tmp_path / "ran"
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        text = (folder / name).read_text()
+        saved = json.loads(text)
+        saved["steps"].append({"class": "subprocess.Popen", "config": {"args": ["touch", str(ran)]}})
+        (folder / name).write_text(json.dumps(saved))
+        with pytest.raises(PipelineError, match=rf"{name}: a step of the policy is the class 'subprocess\.Popen'"):
+            Checkpoint(folder)
+        assert not ran.exists()
+        (folder / name).write_text(text)
+    Checkpoint(folder)
+
+
 @pytest.mark.parametrize("config", [SmolVLAConfig, PI05Config])
 def test_a_checkpoint_whose_packages_are_missing_is_named_with_the_server_that_has_them(
     config: type[SmolVLAConfig | PI05Config], tmp_path: Path

@@ -133,6 +133,21 @@ def test_empty_parentheses_are_named_with_their_section(section: str, with_empty
     assert str(file) in str(caught.value)
 
 
+@pytest.mark.parametrize("fields", ["{expression}", "{expression} {numbers}", "{numbers} {expression}"])
+def test_a_yaw_that_libero_would_run_as_code_is_rejected(fields: str, tmp_path: Path) -> None:
+    """LIBERO evaluates each token, and a token of Python needs no space. It reads every repeated field."""
+    file, text = tmp_path / "task.bddl", STOVE.bddl_file.read_text()
+    expression = "(:yaw_rotation ((__import__['os'] 0.0)))"
+    numbers = re.search(r"\(:yaw_rotation\s+\(\s*\([^()]*\)\s*\)\s*\)", text)
+    assert numbers is not None
+    field = fields.format(expression=expression, numbers=numbers[0])
+    file.write_text(text.replace(numbers[0], field, 1))
+    with pytest.raises(PipelineError, match=r":yaw_rotation has \"__import__\['os'\]\"") as caught:
+        bddl.read(file)
+    assert str(file) in str(caught.value)
+    assert "expected: two numbers in radians" in str(caught.value)
+
+
 def test_a_byte_order_mark_is_named(tmp_path: Path) -> None:
     file = tmp_path / "task.bddl"
     file.write_bytes(b"\xef\xbb\xbf" + STOVE.bddl_file.read_bytes())

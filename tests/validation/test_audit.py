@@ -272,6 +272,23 @@ def test_the_command_ends_with_1_where_something_overlaps(
     assert said["axes"]["camera"]["overlaps"] == 1
 
 
+@pytest.mark.parametrize("key", ["pythonClassName", "type"])
+def test_code_that_a_dataset_names_is_not_run(
+    key: str, datasets: Path, test: TestSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """TFDS imports the module of each feature's class, and a module may be a file of a downloaded dataset."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "downloaded.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()")
+    (source,) = {file.parent for file in datasets.rglob("features.json")}
+    version = shutil.copytree(source, tmp_path / "set" / "1.0.0")
+    content = json.loads((version / "features.json").read_text())
+    content["featuresDict"]["features"]["extra"] = {key: "downloaded.Feature"}
+    (version / "features.json").write_text(json.dumps(content))
+    with pytest.raises(PipelineError, match=r"features\.json: a feature has the class 'downloaded\.Feature'"):
+        audit(tmp_path / "set", test)
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_folder_without_a_dataset_is_rejected(tmp_path: Path, test: TestSet) -> None:
     with pytest.raises(PipelineError, match="no dataset below this folder"):
         audit(tmp_path, test)
