@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from math import ceil
 from pathlib import Path
+from shlex import quote
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -119,29 +120,54 @@ def slurm_jobs(compute_config: ComputeConfig, folder: Path) -> Iterator[SlurmJob
         folder: folder that the work writes into; the nodes must see it too.
 
     Raises:
-        PipelineError: if SLURM rejects the job.
+        PipelineError: if SLURM rejects the job, or the path of the folder contains a space.
     """
+    _reject_spaces(folder)
     logs = (folder / LOGS).absolute()
     workers = compute_config.workers or 1
-    with _cluster(compute_config, logs) as cluster:
+    # Jobs read a certificate of this run in its folder. Programs without it cannot run code in the workers.
+    with _cluster(compute_config, logs, security=True, shared_temp_directory=str(logs)) as cluster:
         _try(cluster.job_script())
         cluster.scale(workers)
         print(f"{workers} jobs wait in SLURM's queue; their output is in {logs}", file=sys.stderr)
         yield SlurmJobs(cluster, workers, logs)
 
 
-def check_job(compute_config: ComputeConfig) -> None:
+def check_job(compute_config: ComputeConfig, folder: Path) -> None:
     """Ask SLURM to check the job of a worker, without submitting it.
 
+    Args:
+        compute_config: section with ``cluster: slurm``.
+        folder: folder that the work would write into.
+
     Raises:
-        PipelineError: if SLURM rejects the job, or is not installed.
+        PipelineError: if SLURM rejects the job or is not installed, or if the path of the folder contains a space.
     """
-    with TemporaryDirectory() as folder, _cluster(compute_config, Path(folder)) as cluster:
+    _reject_spaces(folder)
+    with TemporaryDirectory() as logs, _cluster(compute_config, Path(logs)) as cluster:
         _try(cluster.job_script())
 
 
-def _cluster(compute_config: ComputeConfig, logs: Path) -> Any:
-    """Return a ``SLURMCluster`` without jobs, a context in which its scheduler runs."""
+def _reject_spaces(folder: Path) -> None:
+    """Raise a ``PipelineError`` for a path with a space, which dask-jobqueue does not quote in a job's script."""
+    path = str(folder.absolute())
+    if len(path.split()) != 1:
+        raise PipelineError(
+            "the path of the run's folder contains a space, which the script of a SLURM job cannot have",
+            where=path,
+            remedy="set folder to a path without spaces",
+        )
+
+
+def _cluster(compute_config: ComputeConfig, logs: Path, **security: Any) -> Any:
+    """Return a ``SLURMCluster`` without jobs, a context in which its scheduler runs.
+
+    Args:
+        compute_config: section with ``cluster: slurm``.
+        logs: folder of the jobs' output.
+        security: arguments of ``SLURMCluster`` about certificates.
+    """
+    import dask
     from dask_jobqueue.slurm import SLURMCluster
 
     job = compute_config.slurm or SlurmConfig()
@@ -159,9 +185,11 @@ def _cluster(compute_config: ComputeConfig, logs: Path) -> Any:
         job_extra_directives=[*_of_site("job-extra-directives", "job-extra"), *job.options],
         job_script_prologue=[*_of_site("job-script-prologue", "env-extra"), environment],
         log_directory=str(logs),
+        python=dask.config.get("jobqueue.slurm.python", None) or quote(sys.executable),
         # SLURM limits memory itself.
         worker_extra_args=[*_of_site("worker-extra-args", "extra"), "--memory-limit", "0"],
         scheduler_options={"dashboard_address": "127.0.0.1:0", **_scheduler_of_site()},
+        **security,
     )
 
 

@@ -79,6 +79,8 @@ def _started(workers: int) -> Any:
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
                 memory_limit=None,
+                # A certificate of this run keeps other users of this machine from running code in the workers.
+                security=True,
                 silence_logs=logging.CRITICAL,
             )
         except RuntimeError as error:

@@ -83,7 +83,7 @@ def check(run: Run, need_gb: float) -> list[Diagnosis]:
         *_further_sources(),
         _disk(run, need_gb),
         _machine(run.config.compute),
-        *_slurm(run.config.compute),
+        *_slurm(run.config.compute, run.folder),
     ]
 
 
@@ -363,12 +363,12 @@ def _machine(compute: ComputeConfig) -> Diagnosis:
     return Diagnosis("machine", "ok", detail)
 
 
-def _slurm(compute: ComputeConfig) -> Iterator[Diagnosis]:
-    """Let SLURM check the job of a worker, for a configuration with such jobs."""
+def _slurm(compute: ComputeConfig, folder: Path) -> Iterator[Diagnosis]:
+    """Let SLURM check the job of a worker that writes into the folder, for a configuration with such jobs."""
     if compute.cluster != "slurm":
         return
     try:
-        slurm.check_job(compute)
+        slurm.check_job(compute, folder)
     except PipelineError as error:
         yield Diagnosis("SLURM", "fail", error.what, error.remedy or "")
     else:

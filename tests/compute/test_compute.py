@@ -15,7 +15,7 @@ import psutil
 import pytest
 from compute_work import BLOCK_BYTES, die, die_or_hang, gpu, mark, pages_asked_for, process, reject_two, square
 from conftest import REPOSITORY
-from distributed import Nanny
+from distributed import LocalCluster, Nanny
 
 from pipeline import gl
 from pipeline.compute.pool import TRIES, Expendable, loop, runner
@@ -36,12 +36,13 @@ def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
             run(reject_two, numbers, "rejections")
         assert caught.value.remedy == "leave it out"
 
-        from distributed import get_client
-
-        address = get_client().scheduler.address
-        with runner(ComputeConfig(cluster=address), tmp_path) as elsewhere:
-            assert set(elsewhere(process, numbers, "processes")) == workers
-        assert list(tmp_path.iterdir()) == []
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster,
+        runner(ComputeConfig(cluster=cluster.scheduler_address), tmp_path) as run,
+    ):
+        assert run(square, numbers, "squares") == [n * n for n in numbers]
+        assert workers.isdisjoint(run(process, numbers, "processes"))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -1,5 +1,8 @@
-"""Local workers: nothing listens beyond this machine, and no profiler keeps the frames of the work."""
+"""Local workers: nothing listens beyond this machine, no stranger connects, and no profiler keeps frames."""
 
+import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -38,3 +41,29 @@ def test_local_workers_listen_on_this_machine_alone_and_are_not_profiled(tmp_pat
     assert len(listening) >= 4
     assert set(listening) == {"127.0.0.1"}
     assert [samples for _, samples in results] == [0, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_another_program_of_this_machine_cannot_run_code_in_the_workers(protocol: str, tmp_path: Path) -> None:
+    """A second process knows the address, and neither the certificate nor the key of the run."""
+    from distributed import get_client
+
+    ran = tmp_path / "ran"
+    with runner(ComputeConfig(cluster="local", workers=1), tmp_path) as workers:
+        assert workers(abs, [-1], "start") == [1]
+        address = get_client().scheduler.address.replace("tls", protocol)
+        code = f"""
+import pathlib
+from distributed import Client, Security
+security = Security() if {protocol!r} == "tcp" else Security.temporary()
+with Client({address!r}, security=security, timeout=5) as client:
+    client.run_on_scheduler(pathlib.Path({str(ran)!r}).touch)
+"""
+        stranger = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False
+        )
+        assert workers(abs, [-1], "still there") == [1]
+    assert not ran.exists()
+    assert stranger.returncode != 0
+    assert re.search("CommClosedError|OSError", stranger.stderr.splitlines()[-1]), stranger.stderr

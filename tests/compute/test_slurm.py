@@ -15,6 +15,7 @@ import dask
 import pytest
 import yaml
 from conftest import REPOSITORY
+from distributed import Client
 from pydantic import ValidationError
 
 from pipeline.compute.pool import runner
@@ -110,6 +111,42 @@ def test_the_work_is_done_by_jobs_of_slurm_and_again_where_one_is_ended(slurm: P
         assert time.monotonic() < deadline, queued
         time.sleep(0.2)
     assert list((tmp_path / "data" / ".work" / "slurm").iterdir())
+
+
+def scheduler_address(_: int) -> str:
+    """Return in a worker the address that it is connected to."""
+    from distributed import get_worker
+
+    return str(get_worker().scheduler.address)
+
+
+@pytest.mark.slow
+def test_jobs_are_connected_by_a_certificate_that_only_this_user_reads(slurm: Path, tmp_path: Path) -> None:
+    compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(memory_gb=0.9))
+    logs = tmp_path / "data" / ".work" / "slurm"
+    with runner(compute, tmp_path / "data") as work:
+        (address,) = work(scheduler_address, [0], "address")
+        modes = {file.stat().st_mode & 0o777 for file in logs.glob(".dask-jobqueue.*")}
+        with pytest.raises(OSError, match="in <TCP"), Client(address.replace("tls", "tcp"), timeout=5):
+            pass
+    assert address.startswith("tls://")
+    assert modes == {0o600}
+
+
+@pytest.mark.slow
+def test_a_folder_with_a_space_is_rejected_by_doctor_and_run(slurm: Path, tmp_path: Path) -> None:
+    compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(memory_gb=0.9))
+    with (
+        pytest.raises(PipelineError, match="contains a space") as caught,
+        runner(compute, tmp_path / "my runs") as work,
+    ):
+        work(job_of, [0], "none")
+    assert str(tmp_path / "my runs") in str(caught.value)
+    config = load(REPOSITORY / "configs" / "starter.yaml").model_copy(
+        update={"compute": compute, "folder": tmp_path / "my runs"}
+    )
+    diagnosis = {finding.name: finding for finding in doctor.check(Run(config), 0.001)}["SLURM"]
+    assert (diagnosis.status, diagnosis.remedy) == ("fail", "set folder to a path without spaces")
 
 
 @pytest.mark.slow
