@@ -180,15 +180,16 @@ def _files_of(path: Path) -> list[Path]:
     """List the files that a user's model names.
 
     Raises:
-        PipelineError: when the model cannot be read, or a file is missing. Also when a picture of an OBJ is damaged, or
-            a file of an MJCF is outside of the model's folder.
+        PipelineError: when the model cannot be read, or when a file is missing or outside of the model's folder. Also
+            when a picture of an OBJ is damaged.
     """
     if path.suffix.lower() == ".obj":
-        return material_files(path)
-    try:
-        files = [path.parent / asset.attrib["file"] for asset in ET.parse(path).iterfind("asset/*[@file]")]
-    except (OSError, ET.ParseError) as error:
-        raise PipelineError(f"the model is not readable ({error})", where=path) from error
+        files = material_files(path)
+    else:
+        try:
+            files = [path.parent / asset.attrib["file"] for asset in ET.parse(path).iterfind("asset/*[@file]")]
+        except (OSError, ET.ParseError) as error:
+            raise PipelineError(f"the model is not readable ({error})", where=path) from error
     for file in files:
         if not file.resolve().is_relative_to(path.parent.resolve()):
             raise PipelineError(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import time
 import urllib.parse
 from dataclasses import dataclass
@@ -14,6 +15,9 @@ from pipeline.errors import PipelineError
 ATTEMPTS = 4
 LONGEST_WAIT_S = 60.0
 MAX_ANSWER_BYTES = 1_000_000
+
+PRINTABLE = re.compile(r"[!-~]*")
+"""Text that can be a header's value: ASCII without spaces and line breaks."""
 
 
 class UnusableError(Exception):
@@ -50,13 +54,19 @@ class LanguageModel:
     backoff_s: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check that the endpoint is an address."""
+        """Check the endpoint's address and the key, which an error does not show."""
         address = urllib.parse.urlsplit(self.endpoint)
         if address.scheme not in ("http", "https") or not address.hostname:
             raise PipelineError(
                 "the endpoint is not an address",
                 where=f"endpoint {self.endpoint!r}",
                 expected="such as http://localhost:8000/v1",
+            )
+        if not PRINTABLE.fullmatch(_key()):
+            raise PipelineError(
+                "the key contains a space, a line break or a character that is not ASCII",
+                where="environment variable OPENAI_API_KEY",
+                expected="one key",
             )
 
     def __call__(self, prompt: str) -> str:
@@ -78,7 +88,7 @@ class LanguageModel:
                 wait_s *= 2
         raise PipelineError(
             f"no answer in {ATTEMPTS} attempts: {'; '.join(dict.fromkeys(faults))}",
-            where=self._url,
+            where=self._shown_url,
             remedy="check that the server runs and keeps up, then run the command again: accepted rewrites are kept",
         )
 
@@ -86,6 +96,12 @@ class LanguageModel:
     def _url(self) -> str:
         """Address for chat completions."""
         return f"{self.endpoint.rstrip('/')}/chat/completions"
+
+    @property
+    def _shown_url(self) -> str:
+        """Address for messages, without the password and the query, which may be secret."""
+        address = urllib.parse.urlsplit(self._url)
+        return address._replace(netloc=address.netloc.rpartition("@")[2], query="").geturl()
 
     def _post(self, prompt: str) -> bytes:
         """Send a prompt once and return the body of the answer.
@@ -96,7 +112,7 @@ class LanguageModel:
             PipelineError: when the address is not usable, or the endpoint rejects the question.
         """
         question = {"model": self.model, "messages": [{"role": "user", "content": prompt}]}
-        key = os.environ.get("OPENAI_API_KEY", "").strip()
+        key = _key()
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         body, deadline = b"", time.monotonic() + self.timeout_s
         try:
@@ -112,7 +128,7 @@ class LanguageModel:
                         raise TimeoutError(f"no whole answer within {self.timeout_s:g} s")
         except (httpx.InvalidURL, ImportError, ValueError) as error:  # a proxy in the environment raises the last two
             raise PipelineError(
-                f"the endpoint cannot be asked ({error})", where=self._url, expected="an http or https address"
+                f"the endpoint cannot be asked ({error})", where=self._shown_url, expected="an http or https address"
             ) from error
         except (OSError, httpx.HTTPError) as error:
             raise _BusyError(str(error) or type(error).__name__) from error
@@ -122,13 +138,18 @@ class LanguageModel:
         fault = f"HTTP status {response.status_code} {response.reason_phrase}: {message}".rstrip(": ")
         if response.status_code == 429 or response.is_server_error:
             retry_after = response.headers.get("Retry-After", "")
-            raise _BusyError(fault, float(retry_after) if retry_after.isdigit() else 0.0)
+            raise _BusyError(fault, float(retry_after) if re.fullmatch("[0-9]+", retry_after) else 0.0)
         raise PipelineError(
             f"the endpoint rejects the question ({fault})",
-            where=self._url,
+            where=self._shown_url,
             expected=f"a chat completion by the model {self.model!r}",
             remedy="check the endpoint, the model's name and the environment variable OPENAI_API_KEY",
         )
+
+
+def _key() -> str:
+    """Return the key for the endpoint, empty if there is none."""
+    return os.environ.get("OPENAI_API_KEY", "").strip()
 
 
 @cache

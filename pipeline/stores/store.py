@@ -79,7 +79,18 @@ class Store(ABC):
         """Return a file's values of ``columns``."""
 
     def path(self, name: str) -> Path:
-        """Return the path of a file; its name may contain folders, and has no suffix."""
+        """Return the path of a file; its name may contain folders, and has no suffix.
+
+        Raises:
+            PipelineError: if the name leaves the folder. A manifest of other origin may have such a name.
+        """
+        if name.startswith("/") or ".." in name.split("/"):
+            raise PipelineError(
+                f"the file {name!r} would be outside this folder",
+                where=self.root,
+                expected="an id of a trajectory or of frames",
+                remedy="use a manifest that a run wrote",
+            )
         return self.root / f"{name}{SUFFIX}"
 
     def names(self) -> list[str]:

@@ -286,6 +286,17 @@ def test_a_model_without_its_picture_is_rejected(folder: Path, tmp_path: Path, m
     assert len(models(own(tmp_path / "mine"))) == 1
 
 
+def test_a_picture_outside_of_the_folder_of_a_model_is_rejected(folder: Path, tmp_path: Path) -> None:
+    """trimesh does not read it, and would convert the model without a picture."""
+    mine = tmp_path / "mine" / "toy_house"
+    write_house(mine, scale=0.01)
+    (mine / "roof.png").rename(tmp_path / "mine" / "roof.png")
+    (mine / "house.mtl").write_text(MATERIALS.replace("roof.png", "../roof.png"))
+    with pytest.raises(PipelineError, match=r"\.\./roof\.png is outside of the model's folder"):
+        models(own(tmp_path / "mine"))
+    assert list(folder.glob("own/*")) == []
+
+
 def test_hidden_files_change_no_model_and_capital_suffixes_are_models(folder: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine" / "cube"
     mine.mkdir(parents=True)

@@ -218,7 +218,7 @@ def test_wrong_counts_are_made_up_for_and_surplus_is_left(server: Server, tmp_pa
 def test_busy_and_broken_endpoints_are_asked_again(server: Server, tmp_path: Path) -> None:
     good = lists(1, 1, 1, 1)
     trouble: list[list[Reply]] = [
-        [status(500), status(503), status(429, Retry_After="0")],
+        [status(500), status(503, Retry_After="\u00b2"), status(429, Retry_After="0")],
         [hangs, hangs_up],
         [trickles],
         [says(None)],
@@ -319,6 +319,23 @@ def test_a_redirect_is_not_followed(server: Server, monkeypatch: pytest.MonkeyPa
     with pytest.raises(PipelineError, match="302"):
         ask(server)("hello")
     assert len(server.asked) == 1
+
+
+@pytest.mark.parametrize("key", ["sk-first\nsk-second", "sk-first sk-second", "sk-ü"])
+def test_a_key_that_no_request_can_have_is_rejected_and_not_shown(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", key)
+    with pytest.raises(PipelineError, match="OPENAI_API_KEY") as caught:
+        LanguageModel("http://localhost:8000/v1", "tiny")
+    assert "sk-" not in str(caught.value)
+
+
+def test_messages_show_neither_the_password_nor_the_query_of_an_endpoint(server: Server) -> None:
+    server.replies = [status(401, b"who are you")]
+    address = server.url.replace("http://", "http://me:secret@")
+    with pytest.raises(PipelineError, match="401") as caught:
+        LanguageModel(f"{address}?token=secret", "tiny")("hello")
+    assert "secret" not in str(caught.value)
+    assert server.url.removeprefix("http://") in str(caught.value)
 
 
 @pytest.mark.parametrize("endpoint", ["localhost:8000", "file:///etc/passwd", "http://"])

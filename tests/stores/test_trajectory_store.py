@@ -92,6 +92,13 @@ def test_quality_is_stored_and_a_filter_drops_by_it(config: Config, rows: list[p
     assert set(judged.values()) == {Verdict(False, "path_m")}
 
 
+@pytest.mark.parametrize("name", ["../notes", "/notes", "deep/../../notes", ".."])
+def test_a_name_that_leaves_the_folder_is_rejected(name: str, tmp_path: Path) -> None:
+    """The ids of a manifest are names of files, and a manifest may be of other origin."""
+    with pytest.raises(PipelineError, match="would be outside this folder"):
+        TrajectoryStore(tmp_path / "trajectories").path(name)
+
+
 def test_a_lost_or_damaged_table_is_rebuilt(trajectories: Path) -> None:
     rows = TrajectoryStore(trajectories).rows()
     (trajectories / TABLE).write_bytes(b"PAR1 and then nothing")
