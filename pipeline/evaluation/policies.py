@@ -370,8 +370,8 @@ class Checkpoint:
         folder: folder with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
 
     Raises:
-        PipelineError: if the policy wants an image that the tasks do not have, if its weights were not loaded, if its
-            packages are missing, or if its folder names code of other packages.
+        PipelineError: if the policy wants an image that the tasks do not have, if its weights were not loaded, or if
+            its packages are missing. Also if its folder names code of other packages.
     """
 
     wanted = Wanted()
