@@ -6,6 +6,7 @@ code of lerobot writes them. A trace has the form of the keypoints in lerobot's 
 """
 
 import json
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,10 @@ from pipeline.episode_schema import ALL_VIEWS, SCHEMA
 from pipeline.types import Episode, Geometry
 
 MOTION_STEPS = 10
-"""Steps (0.5 s) whose movement one text of ``motion`` describes. A trace begins at every such step."""
+"""Steps (0.5 s) whose movement one text of ``motion`` describes. A trace begins at every such step.
+
+The last text describes the remaining steps too, up to 19 in all: the movement in one or two steps has no direction.
+"""
 
 LEAST_M = 0.01
 """Least displacement along an axis within ``MOTION_STEPS`` that is called a movement."""
@@ -63,8 +67,9 @@ def persistent_annotations(episode: Episode, *, train: bool) -> list[Annotation]
         annotations += [Annotation("user", "task_aug", 0, text) for text in wordings]
     annotations += [Annotation("assistant", "subtask", step, text) for step, text in episode.subtasks]
     previous = ""
-    for step in range(0, len(episode), MOTION_STEPS):
-        text = _motion(episode, step)
+    starts = range(0, max(len(episode) - MOTION_STEPS, 0) + 1, MOTION_STEPS)
+    for step, next_step in pairwise([*starts, len(episode)]):
+        text = _motion(episode, step, next_step)
         if text != previous:
             annotations.append(Annotation("assistant", "motion", step, text))
         previous = text
@@ -93,13 +98,13 @@ def event_annotations(episode: Episode, size_px: int) -> list[Annotation]:
     return annotations
 
 
-def _motion(episode: Episode, step: int) -> str:
-    """Describe the movement of the gripper in the ``MOTION_STEPS`` from a step on, in words of LIBERO's instructions.
+def _motion(episode: Episode, step: int, next_step: int) -> str:
+    """Describe the movement of the gripper from a step to the step of the next text, in words of LIBERO's instructions.
 
     Their left is -y: the robot's right. Forward is +x, the direction in which the robot of every arena looks. Turns are
     seen from above.
     """
-    last = min(step + MOTION_STEPS, len(episode) - 1)
+    last = min(next_step, len(episode) - 1)
     words = _direction(episode.state[last, :3] - episode.state[step, :3])
     parts = [f"move {words}"] if words else []
     start, end = (Rotation.from_rotvec(episode.state[t, 3:6].astype(np.float64)) for t in (step, last))
@@ -108,7 +113,7 @@ def _motion(episode: Episode, step: int) -> str:
         axis = int(np.argmax(np.abs(turn_deg)))
         upright = "turn counterclockwise" if turn_deg[2] > 0 else "turn clockwise"
         parts.append(upright if axis == 2 else "tilt")
-    commands = np.sign(episode.action[max(step - 1, 0) : step + MOTION_STEPS, 6])
+    commands = np.sign(episode.action[max(step - 1, 0) : next_step, 6])
     if len(set(commands)) > 1:
         parts.append("close the gripper" if commands[-1] > 0 else "open the gripper")
     return ", ".join(parts) or "stay"

@@ -80,7 +80,8 @@ def wrong_sample(column: str, stored: Stored, levels: NDArray[np.int64], steps: 
     if not (np.abs(figures["mean"] - mean) <= MEAN_LEVELS / 255).all():
         statement = f"mean of {column} is {figures['mean'].tolist()} in the statistics"
         yield statement, f"{mean.tolist()} within {MEAN_LEVELS:g} of 255 levels"
-    if not ((figures["std"] * DEVIATION >= std) & (figures["std"] <= std * DEVIATION)).all():
+    low, high = std / DEVIATION - SAME, std * DEVIATION + SAME
+    if not ((low <= figures["std"]) & (figures["std"] <= high)).all():
         statement = f"std of {column} is {figures['std'].tolist()} in the statistics"
         yield statement, f"{std.tolist()} within a factor of {DEVIATION:g}"
     yield from disordered(column, stored)
@@ -110,9 +111,10 @@ def _of_levels(levels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Compute mean, deviation and range in [0, 1] of pixels from the counts of their levels, (3, 256)."""
     values, pixels = np.arange(256) / 255, levels.sum(axis=1)
     mean = levels @ values / pixels
+    deviations = values - mean[:, None]
     return {
         "mean": mean,
-        "std": np.sqrt(levels @ values**2 / pixels - mean**2),
+        "std": np.sqrt((levels * deviations**2).sum(axis=1) / pixels),
         "min": np.array([values[channel > 0].min() for channel in levels]),
         "max": np.array([values[channel > 0].max() for channel in levels]),
     }

@@ -71,6 +71,25 @@ def test_a_movement_is_in_words(
     assert motions(moving((x / 1000, y / 1000, z / 1000), turn_deg, grip)) == expected
 
 
+@pytest.mark.parametrize("steps", [1, 5, 9, 10, 11, *range(19, 32)])
+def test_an_even_movement_has_one_text_whatever_the_length_of_the_episode(steps: int) -> None:
+    """The steps after the last whole half second are too few to name a direction."""
+    made = moving((0.005, 0.0, 0.0), (0, 0, 0), np.full(steps, -1, np.float32))
+    assert motions(made) == [(0, "move forward" if steps > 2 else "stay")]
+
+
+@pytest.mark.parametrize(("step_mm", "text"), [(1.05, "move forward"), (0.95, "stay")])
+def test_a_centimetre_in_half_a_second_is_a_movement(step_mm: float, text: str) -> None:
+    """Twenty-one states have two windows, both of ten steps."""
+    made = moving((step_mm / 1000, 0.0, 0.0), (0, 0, 0), np.full(21, -1, np.float32))
+    assert motions(made) == [(0, text)]
+
+
+def test_a_release_in_the_last_steps_is_part_of_the_last_text() -> None:
+    grip = np.hstack([np.full(22, 1, np.float32), np.full(3, -1, np.float32)])
+    assert motions(moving((0.0, 0.0, 0.0), (0, 0, 0), grip)) == [(0, "stay"), (10, "open the gripper")]
+
+
 def test_left_is_the_left_of_libero_s_instructions() -> None:
     """LIBERO's own files place each thing that a name calls left or right: 52 pairs of regions."""
     places = re.compile(r"\((\w+)_(left|right)(\w*_region)\s+\(:target \w+\)\s+\(:ranges \(\s*\(([-.\d ]+)\)")

@@ -127,7 +127,7 @@ class LeRobot(Format[LeRobotConfig]):
     title: ClassVar = "LeRobot"
     options_type: ClassVar = LeRobotConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 15
+    recipe: ClassVar = 16
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     held_out_place: ClassVar = (
         "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless "
