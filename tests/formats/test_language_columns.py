@@ -111,8 +111,8 @@ def test_every_frame_has_the_rewrites_and_subtasks_of_its_episode(root: Path) ->
         assert [each["content"] for each in wordings] == list(expected)
         assert {(each["role"], each["timestamp"]) for each in wordings} <= {("user", 0.0)}
         motions = [(each["role"], each["content"], each["timestamp"]) for each in said if each["style"] == "motion"]
-        # The hand of every tenth step turns again, and its fingers close at step 6.
-        assert [round(at_s * 20) for _, _, at_s in motions] == [0, 10][: 1 + (len(source) > 10)]
+        # The hand of every tenth step turns again, and its fingers close at step 6. A text has ten steps or more.
+        assert [round(at_s * 20) for _, _, at_s in motions] == [0, 10][: 1 + (len(source) >= 20)]
         assert {role for role, _, _ in motions} == {"assistant"}
         assert motions[0][1].startswith("move forward, ")
         assert motions[0][1].endswith(", close the gripper")
