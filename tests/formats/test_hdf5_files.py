@@ -5,12 +5,13 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from io import BytesIO
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -123,9 +124,30 @@ def test_a_quaternion_keeps_the_sign_of_robosuites_axis_angle(tmp_path: Path) ->
         np.testing.assert_allclose(file["data/demo_0/robot_states"][:3, 5:], expected, atol=1e-6)
 
 
+BOXED = (2, 9)
+"""Instances with pixels and boxes."""
+
+
+@cache
+def with_boxes(episode_id: str) -> Episode:
+    """Generate the episode of ``with_extras`` with two moving rectangles as masks, and their boxes."""
+    source = with_extras(episode_id)
+    masks = np.zeros((len(source), 256, 256), np.uint8)
+    boxes = np.zeros((len(source), 24, 4), np.float32)
+    for step in range(len(source)):
+        for instance, (x, y) in zip(BOXED, ((step, 40), (100, 200 + step)), strict=True):
+            masks[step, y : y + 30, x : x + 10 + step] = instance
+            boxes[step, instance] = x, y, 10 + step, 30
+    files = [cv2.imencode(".png", mask)[1].tobytes() for mask in masks]
+    views = {}
+    for view, geometry in source.geometry.items():
+        views[view] = replace(geometry, maps={**geometry.maps, "segmentation": files}, boxes=boxes)
+    return replace(source, geometry=views)
+
+
 def test_extras_and_matrices_are_those_of_the_raw_frames(tmp_path: Path) -> None:
-    target = write_hdf5(tmp_path, with_extras, extras=EXTRAS)
-    source = with_extras(IDS[0])
+    target = write_hdf5(tmp_path, with_boxes, extras=EXTRAS)
+    source = with_boxes(IDS[0])
     with h5py.File(target.folder / FILE) as file:
         demo = file["data/demo_0"]
         for view, name in (("image", "agentview"), ("wrist_image", "eye_in_hand")):
@@ -135,13 +157,18 @@ def test_extras_and_matrices_are_those_of_the_raw_frames(tmp_path: Path) -> None
                 assert (stored.shape, stored.dtype) == ((len(source), 256, 256, 1), dtype)
                 png = geometry.maps["depth" if extra == "depth" else "segmentation"][3]
                 np.testing.assert_array_equal(stored[3, ..., 0], np.array(Image.open(BytesIO(png)))[::-1, ::-1])
+            expected = np.zeros((len(source), 24, 4), np.float32)
+            for step, mask in enumerate(demo[f"obs/{name}_segmentation"][..., 0]):
+                for instance in BOXED:
+                    expected[step, instance] = cv2.boundingRect((mask == instance).astype(np.uint8))
+            np.testing.assert_array_equal(demo[f"obs/{name}_boxes"], expected)
             # The pixel (10, 20) of a rotated frame is the pixel (245, 235) of the raw frame.
             point = np.linalg.solve(geometry.intrinsics.astype(float), [10.0, 20.0, 1.0])
             np.testing.assert_allclose(demo.attrs[f"{name}_intrinsics"] @ point, [245.0, 235.0, 1.0], atol=1e-6)
             np.testing.assert_array_equal(demo.attrs[f"{name}_extrinsics"], geometry.extrinsics)
         np.testing.assert_array_equal(demo["obs/object_poses"], source.object_poses)
         assert json.loads(demo.attrs["instances"]) == list(source.instances)
-    assert faults(target, source=with_extras) == {}
+    assert faults(target, source=with_boxes) == {}
 
 
 def test_rewrites_subtasks_and_a_missed_goal_are_stored(tmp_path: Path) -> None:

@@ -16,13 +16,40 @@ from every_set import MIN_PSNR_DB, pixels, psnr_db, spread
 from numpy.typing import NDArray
 from synthetic import EXTRAS, IDS, REPO, SET, episode, files, with_extras, write_lerobot_v21
 
+from pipeline.episode_schema import Content
 from pipeline.formats import lerobot
+from pipeline.formats.episodes import Piece
+from pipeline.formats.lerobot import write_v21
+from pipeline.formats.lerobot.columns import CONVENTIONS, Layout
 
 V21 = {
     "ipec": (SET, "observation.images.image", "observation.images.wrist_image", "observation.state", "action"),
     "openpi": (REPO, "image", "wrist_image", "state", "actions"),
 }
 """Convention to its set and its columns."""
+
+
+def test_the_entries_of_poses_and_boxes_are_named_row_by_row() -> None:
+    columns = Layout(Content(extras=EXTRAS), CONVENTIONS["ipec"], "video").described
+    poses, boxes = columns["object_poses"]["names"], columns["camera.agent.boxes"]["names"]
+    assert (len(poses), len(boxes)) == (24 * 7, 24 * 4)
+    assert poses[:8] == ["0_x_m", "0_y_m", "0_z_m", "0_w", "0_x", "0_y", "0_z", "1_x_m"]
+    assert boxes[:5] == ["0_x_px", "0_y_px", "0_width_px", "0_height_px", "1_x_px"]
+    assert (poses[-1], boxes[-1]) == ("23_z", "23_height_px")
+
+
+@pytest.mark.parametrize(("episodes", "chunks"), [(1, 1), (1000, 1), (1001, 2)])
+def test_a_chunk_has_a_thousand_episodes(
+    episodes: int, chunks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without files of episodes, whose common files are left out."""
+    (tmp_path / "piece").mkdir()
+    for name in write_v21.LINES:
+        (tmp_path / "piece" / name).write_text("")
+    monkeypatch.setattr(write_v21, "write_common", lambda *_: {})
+    piece = Piece("piece", [f"episode-{number}" for number in range(episodes)], steps=episodes)
+    write_v21.finish(tmp_path, tmp_path / "set", [piece], Layout(Content(), CONVENTIONS["openpi"], "images"))
+    assert json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["total_chunks"] == chunks
 
 
 @pytest.mark.parametrize("convention", V21)
