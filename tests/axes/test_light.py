@@ -14,6 +14,7 @@ from conftest import MILK
 
 from pipeline.axes.base import Level
 from pipeline.axes.light import TILT_AZIMUTH_DEG, Component, LightAxis, LightPerturbation, exposure
+from pipeline.libero.tasks import find_task
 from pipeline.rendering.renderer import Renderer
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
@@ -153,6 +154,35 @@ def test_a_third_lamp_dims_the_others_where_it_lights_the_whole_room(directional
     assert model.light_diffuse == pytest.approx(np.full((3, 3), left))
 
 
+def test_gloss_takes_diffuse_light_and_fill_becomes_emission() -> None:
+    """Of the lamp's 0.8, 0.7 are left with shadows, 0.7 of these beyond the fill, and half of these beyond the gloss.
+
+    The sixth root of 64 is 2. The fill is 0.3 of 0.7, of which surfaces emit a third.
+    """
+    model = mujoco.MjModel.from_xml_string("""
+        <mujoco>
+          <asset><material name="floor" specular="0"/><material name="mug" specular="0.9" shininess="0.5"/></asset>
+          <worldbody><light diffuse=".8 .8 .8" specular=".3 .3 .3"/></worldbody>
+        </mujoco>""")
+    NEUTRAL.model_copy(update={"specular_scale": 64.0, "shadows": True, "fill_scale": 0.3}).apply(model)
+    assert model.light_diffuse == pytest.approx(np.full((1, 3), 0.245))
+    assert model.light_specular == pytest.approx(np.full((1, 3), 0.5))
+    assert model.mat_emission == pytest.approx(np.array([0.07, 0.07]))
+    assert model.mat_specular == pytest.approx(np.array([0.75, 0.9]))
+    assert model.mat_shininess == pytest.approx(np.array([0.1, 0.5]))
+
+
+def test_the_kitchens_lamps_are_never_brightened() -> None:
+    """Unlike the floor's, which some samples brighten."""
+    kitchen, floor = find_task("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove"), MILK
+    axis = LightAxis(components=("diffuse", "combined"))
+    brightest = {}
+    for task in (kitchen, floor):
+        lights = [axis.sample(rng("key", key), task, 0) for key in range(200)]
+        brightest[task] = max(max(light.diffuse_scale_rgb) for light in lights)
+    assert brightest[kitchen] <= 1.0 < brightest[floor]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("shown", TASKS, indirect=True)
 def test_every_lamp_changes_and_nothing_but_lamps(shown: Renderer, request: pytest.FixtureRequest) -> None:
@@ -241,6 +271,28 @@ def test_exposure_names_what_is_wrong() -> None:
     blue = np.zeros((64, 64, 3), np.uint8)
     blue[..., 2] = 255
     assert exposure(blue) is None, "a pure colour is neither"
+
+
+def with_share(level: int, share: float) -> Frame:
+    """A grey frame (100, 100, 3) of which a share of the pixels has another level."""
+    frame = np.full((100, 100, 3), 128, np.uint8)
+    frame.reshape(-1, 3)[: round(10_000 * share)] = level
+    return frame
+
+
+@pytest.mark.parametrize(
+    ("level", "share", "expected"),
+    [
+        (10, 0.59, None),
+        (10, 0.61, "too_dark"),
+        (11, 1.0, None),
+        (250, 0.24, None),
+        (250, 0.26, "blown_out"),
+        (249, 1.0, None),
+    ],
+)
+def test_a_frame_may_be_three_fifths_dark_and_a_quarter_bright(level: int, share: float, expected: str | None) -> None:
+    assert exposure(with_share(level, share)) == expected
 
 
 def test_it_claims_no_proof_that_cannot_be_had() -> None:

@@ -8,6 +8,7 @@ import pytest
 from conftest import MILK, PLATE, starter_demo
 from scipy.spatial.transform import Rotation
 
+from pipeline.axes.report_data import BENCHMARK, Histogram, Strips
 from pipeline.axes.robot import RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
 from pipeline.errors import RejectedError
@@ -112,6 +113,19 @@ def test_every_test_offset_is_found_and_perturbations_keep_their_clearance() -> 
     clear = [p.nearest(TEST, PLATE).distance >= p.clearance for p in sample_many(RobotAxis(), 1000)]
     assert np.mean(clear) > 0.99
     assert turned(*[0.1] * 7).nearest(TestSet(()), PLATE) == (np.inf, 0)
+
+
+def test_distances_and_plots_belong_to_the_test_with_the_offset() -> None:
+    """The benchmark counts its classes from 1: test 1 has the posture of MountedPanda1."""
+    published = np.array(PUBLISHED_RAD[1]) - HOME_RAD
+    distances = turned(*published).distances(TEST, PLATE)
+    assert (distances < 1e-7).tolist() == [True, False, False]
+    norms, joints = RobotAxis.describe_coverage([], TEST).plots
+    assert isinstance(norms, Histogram)
+    assert isinstance(joints, Strips)
+    assert norms.groups[BENCHMARK] == pytest.approx([0.1, 0.2, 0.5])
+    for values, offset in zip(joints.rows.values(), published, strict=True):
+        assert np.abs(values[BENCHMARK] - offset).min() < 1e-7
 
 
 def test_only_the_arm_changes(scene: Scene) -> None:
