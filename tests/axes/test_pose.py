@@ -1,9 +1,11 @@
 """Pose: the right object moves, as far as its level says, and stays where the instruction says it is."""
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from pipeline.physics.replay import replay, roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
-from pipeline.types import Scene, Task, Trajectory
+from pipeline.types import Floats, Scene, Task, Trajectory
 
 COOKIES = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate")
 NEXT_TO = find_task("libero_spatial", "pick_up_the_black_bowl_next_to_the_plate_and_place_it_on_the_plate")
@@ -242,6 +244,38 @@ def test_a_scenes_moves_are_uniform_over_the_disk() -> None:
     moves_m = np.array([(move.dx_m, move.dy_m) for one in perturbations for move in one.moves if move.name == "milk_1"])
     assert np.abs(moves_m.mean(axis=0)).max() < 0.004
     assert np.mean(np.linalg.norm(moves_m, axis=1) < 0.015) == pytest.approx(1 / 4, abs=0.08), "of a radius of 0.03"
+
+
+def centres_in_file(task: Task) -> tuple[dict[str, Floats], set[str]]:
+    """Read the middle (2,) in m of the region of each thing on the surface, and the names of the fixtures."""
+    text = task.bddl_file.read_text()
+    bound = r"\s*(-?[\d.e-]+)"
+    ranges = re.findall(rf"\((\w+)\s+\(:target (\w+)\)\s+\(:ranges \(\s+\({bound * 4}", text)
+    middles_m = {}
+    for name, surface, left, low, right, high in ranges:
+        corners_m = np.array([[float(left), float(low)], [float(right), float(high)]])
+        middles_m[f"{surface}_{name}"] = corners_m.mean(axis=0)
+    (start,) = re.findall(r"\(:init(.*?)\(:goal", text, re.DOTALL)
+    placed = re.findall(r"\(On (\w+) (\w+)\)", start)
+    (fixtures,) = re.findall(r"\(:fixtures(.*?)\(:objects", text, re.DOTALL)
+    centres_m = {thing: middles_m[region] for thing, region in placed if region in middles_m}
+    return centres_m, set(re.findall(r"\w+_\d+", fixtures))
+
+
+@pytest.mark.parametrize(
+    ("task", "fixture", "share", "enough_m"),
+    [(MILK, False, 0.75, 0.15), (STOVE, True, 0.9, 0.25)],
+    ids=["objects", "fixtures"],
+)
+def test_no_two_things_come_much_closer(task: Task, fixture: bool, share: float, enough_m: float) -> None:
+    centres_m, fixtures = centres_in_file(task)
+    pairs = [pair for pair in combinations(centres_m, 2) if bool(fixtures & {*pair}) == fixture]
+    margins_m = []
+    for scene in sample_scenes(task, 60, 4):
+        for first, second in pairs:
+            away_m = math.dist(centres_m[first] + scene.shifts[first], centres_m[second] + scene.shifts[second])
+            margins_m.append(away_m - min(enough_m, share * math.dist(centres_m[first], centres_m[second])))
+    assert -1e-9 <= min(margins_m) < 0.01, "some pairs come as close as they may"
 
 
 def test_the_goal_suites_bowl_goes_where_the_benchmark_has_it_unless_the_hand_needs_it() -> None:

@@ -102,12 +102,14 @@ def test_a_moved_basket_is_where_the_milk_is_let_go(milk: Reference) -> None:
     assert np.allclose(route.positions_m[release], milk.positions_m[release] + shift, rtol=0, atol=1e-9)
 
 
+def during(*runs: tuple[int, int]) -> Mask:
+    """Return a mask (101,) that is True from the first to the last step of each run."""
+    return np.array([any(first <= step <= last for first, last in runs) for step in range(101)])
+
+
 def one_after_the_other() -> Reference:
     """A hand that puts a mug on a plate, rests on the table, and then takes a cup to a region."""
     steps = np.arange(101)
-
-    def during(*runs: tuple[int, int]) -> Mask:
-        return np.array([any(first <= step <= last for first, last in runs) for step in steps])
 
     def carried_over(first: int, last: int) -> Floats:
         poses = np.tile([0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0], (101, 1))
@@ -129,9 +131,9 @@ def one_after_the_other() -> Reference:
     )
 
 
-def bend(**shifts: float) -> Floats:
-    """(K+1,) m by which the route is moved along x when things are."""
-    reference = one_after_the_other()
+def bend(reference: Reference | None = None, /, **shifts: float) -> Floats:
+    """(K+1,) m by which the route is moved along x when things are, by default through ``one_after_the_other``."""
+    reference = reference or one_after_the_other()
     poses = {name: reference.poses[name][0].copy() for name in reference.poses} | {
         name: pose.copy() for name, pose in reference.places.items()
     }
@@ -158,6 +160,55 @@ def test_what_moves_alike_is_followed_once() -> None:
     assert both.max() <= 0.04 + 1e-9
     apart = bend(mug_1=0.04, plate_1=-0.02, cup_1=0.03, region=-0.04)
     assert apart[[6, 12, 36, 45, 66, 71, 95]] == pytest.approx([0.04, 0.04, -0.02, -0.02, 0.03, 0.03, -0.04], abs=1e-4)
+
+
+def test_an_object_that_is_grasped_twice_is_followed_until_it_is_first_carried_off() -> None:
+    reference = one_after_the_other()
+    twice = replace(reference, carried={**reference.carried, "mug_1": during((12, 20), (32, 39))})
+    assert bend(twice, mug_1=0.04)[[6, 12, 16, 32]] == pytest.approx([0.04, 0.04, 0, 0], abs=1e-9)
+
+
+def test_a_place_is_no_longer_followed_shortly_before_the_next_contact() -> None:
+    """The cup is touched at step 70."""
+    assert bend(plate_1=0.04)[[45, 66, 71]] == pytest.approx([0.04, 0, 0], abs=1e-9)
+
+
+def test_a_place_that_an_object_is_pushed_to_is_followed_from_the_start_of_the_push() -> None:
+    """The cup is pushed along the table from step 20 on, and reaches the region at step 60."""
+    pushed, never = during((20, 65)), during()
+    pose = one_after_the_other().poses["cup_1"]
+    reference = replace(
+        one_after_the_other(),
+        busy=pushed,
+        engaged=pushed,
+        held={"cup_1": pushed},
+        carried={"cup_1": never},
+        met={"cup_1": never, "region": during((60, 65))},
+        poses={"cup_1": pose},
+    )
+    route = bend(reference, region=0.04)
+    assert route[[20, 56, 65]] == pytest.approx([0, 0.04, 0.04], abs=1e-9)
+    assert np.diff(route).max() < 0.003, "evenly over the 36 steps, and not at the end of the push"
+
+
+def test_of_two_things_met_at_once_the_longer_met_is_followed() -> None:
+    reference, never = one_after_the_other(), during()
+    tray = {"tray_1": reference.poses["plate_1"]}
+    both = replace(
+        reference,
+        held={"tray_1": never, **reference.held},
+        carried={"tray_1": never, **reference.carried},
+        met={"tray_1": during((40, 42)), **reference.met},
+        poses={**tray, **reference.poses},
+    )
+    assert bend(both, tray_1=-0.04)[42] == pytest.approx(-0.04, abs=1e-9)
+    assert bend(both, tray_1=-0.04, plate_1=0.03)[42] == pytest.approx(0.03, abs=1e-9)
+
+
+def test_a_thing_that_the_hand_moves_comes_before_a_thing_that_it_meets_for_longer() -> None:
+    reference = one_after_the_other()
+    both = replace(reference, met={**reference.met, "plate_1": during((10, 45))})
+    assert bend(both, mug_1=0.04, plate_1=-0.02)[[12, 36]] == pytest.approx([0.04, -0.02], abs=1e-9)
 
 
 def tilted(pose: Floats, angle_rad: float) -> Floats:

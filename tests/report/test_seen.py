@@ -11,10 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import MILK, REPOSITORY
+from scipy.spatial.transform import Rotation
 
 from pipeline.axes import AXES, Axis, Perturbation, from_json
+from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.axes.layout import LayoutAxis
-from pipeline.axes.pose import PoseAxis
+from pipeline.axes.pose import Move, PoseAxis, ScenePerturbation
 from pipeline.axes.report_data import KeptPerturbation
 from pipeline.config import Config, DemosConfig, PlanConfig, ReplayConfig, load
 from pipeline.export_config import Where
@@ -145,6 +147,36 @@ def test_a_look_has_the_speeds_of_the_hand_and_of_the_fastest_object() -> None:
     at[2:4], moving[:2], moving[-6:] = (0.03, -0.01), (0.3, 2.0), (0.3, 0.4, 0, 5, 5, 5)
     measured = seen.clean_measures(Look.of(model, np.hstack([0.0, at, moving])))
     assert [*measured.values()] == pytest.approx([40, 30, 50])
+
+
+def look_at(*position_m: float) -> Look:
+    """A hand at rest."""
+    return Look(np.array(position_m), Rotation.identity(), gripper_mm=80.0, hand_cm_s=0.0, object_cm_s=0.0)
+
+
+def test_looks_are_apart_in_centimetres() -> None:
+    assert look_at(0.01, 0.02, -0.02).moved_cm(look_at(0.0, 0.0, 0.0)) == pytest.approx(3)
+
+
+def test_a_push_is_measured_when_it_ends() -> None:
+    """The hand is 1 cm further away after each step; the push begins before step 8 and lasts 4 steps."""
+    push = DisturbancePerturbation(
+        level=3, body="robot0_right_hand", wrench=(0, 50, 0, 0, 0, 0), first_step=8, steps=4, away_steps=5
+    )
+    episode: Any = SimpleNamespace(
+        look=lambda step: look_at(0.01 * step, 0.0, 1.0), twin_look=lambda step: look_at(0.0, 0.0, 1.0)
+    )
+    ((_, away_cm),) = push.observe(episode)
+    assert away_cm == pytest.approx(12)
+
+
+def test_an_expanded_demonstrations_displacement_is_measured_too() -> None:
+    moves, source_moves = (Move(name="milk_1", dx_m=0.02, dy_m=0.0),), (Move(name="milk_1", dx_m=0.01, dy_m=-0.04),)
+    scene = ScenePerturbation(level=2, moves=moves, source_moves=source_moves)
+    episode: Any = SimpleNamespace(task=MILK)
+    ((what, moved_cm),) = scene.observe(episode)
+    assert what == "displacement of the target in libero_object, level 2 (cm)"
+    assert moved_cm == pytest.approx(5)
 
 
 def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:

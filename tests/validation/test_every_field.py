@@ -74,9 +74,7 @@ def found_in_first(target: Format[Any], folder: Path) -> list[str]:
         return [str(error)]
 
 
-def of_first(
-    target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path, witness: bool = True
-) -> list[Fault]:
+def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path, witness: bool = True) -> list[Fault]:
     source = episode(IDS[0])
     copy = target.read(kept[IDS[0]])
     if copy is None:
