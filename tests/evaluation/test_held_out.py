@@ -15,6 +15,7 @@ from episode_results import analyze, result
 from pipeline.axes import Perturbation, to_json
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
+from pipeline.axes.robot import RobotPerturbation
 from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
@@ -47,6 +48,33 @@ def test_a_planted_copy_of_a_held_out_perturbation_is_found(axis: str) -> None:
     assert other["draws"] == 5
     assert other["planned"] == 1
     assert held_out.compare(sampled, PlannedPerturbations([]))[axis]["smallest"] is None
+
+
+def camera_at(azimuth_deg: float) -> CameraPerturbation:
+    return CameraPerturbation(component="spherical", level=1, azimuth_deg=azimuth_deg)
+
+
+def robot_at(offset_rad: float) -> RobotPerturbation:
+    offsets_rad = (offset_rad, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return RobotPerturbation(component="initial_joints", level=1, joint_offsets_rad=offsets_rad)
+
+
+@pytest.mark.parametrize(
+    ("sampled", "near", "far"),
+    [(camera_at(20), camera_at(22), camera_at(32)), (robot_at(0.1), robot_at(0.11), robot_at(0.13))],
+)
+def test_a_planned_perturbation_within_the_clearance_overlaps(
+    sampled: Perturbation, near: Perturbation, far: Perturbation
+) -> None:
+    """Two degrees of azimuth are below the clearance of 5 degrees, and 0.01 rad below that of 0.02 rad."""
+    task = EvaluationTask("own", STOVE.suite, STOVE.name, "a", sampled.axis, sampled.component, 1, 0)
+    overlaps = []
+    for planned_perturbation in (near, far):
+        planned = PlannedPerturbations([planned_row(task, planned_perturbation)])
+        distance, _ = planned.nearest(sampled, STOVE)
+        assert distance > 0
+        overlaps.append(planned.overlap(sampled, STOVE))
+    assert overlaps == [True, False]
 
 
 def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
