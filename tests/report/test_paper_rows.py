@@ -21,6 +21,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from markdown_it import MarkdownIt
+from scipy.stats import binomtest
 from vla_eval.recording import EpisodeRecorder, RecordingStore, db_path_for_eval, serializable_task_kwargs
 from vla_eval.results.export import export_eval
 
@@ -72,6 +73,19 @@ def counted(outcomes: Iterable[Outcome]) -> dict[str, str]:
     return {name: f"{rate:.1f}" for name, rate in rates.items()}
 
 
+def wilson_bounds(outcomes: Iterable[Outcome]) -> dict[str, tuple[str, str]]:
+    """SciPy's intervals in percent, of each column and of all test tasks."""
+    of_column: dict[str, list[bool]] = defaultdict(list)
+    for outcome in outcomes:
+        for name in (column_of(benchmark.load().find(outcome.suite, outcome.name)), "total"):
+            of_column[name].append(outcome.success)
+    bounds = {}
+    for name, successes in of_column.items():
+        found = binomtest(sum(successes), len(successes)).proportion_ci(method="wilson")
+        bounds[name] = (f"{100 * found.low:.1f}", f"{100 * found.high:.1f}")
+    return bounds
+
+
 def of_markdown(text: str) -> dict[str, list[str]]:
     """First cell to the other cells of each line of a Markdown table, as a program for Markdown prints them."""
     rows: list[list[str]] = []
@@ -117,6 +131,10 @@ def test_all_tasks_give_plainly_counted_rates_in_all_formats() -> None:
     assert (line["prompt"], line["step_limits"]) == ("clean", "goal 300, long 520")
     assert of_latex(latex(table)) == [["mine", *(expected[heading] for heading in COLUMNS)]]
     assert "10,030 of 10,030" in markdown(table)
+    bounds = wilson_bounds(policy.outcomes)
+    assert {name: (line[f"{name}_low"], line[f"{name}_high"]) for name in bounds} == bounds
+    written = dict(zip(COLUMNS, of_markdown(markdown(table))["mine, 95 % interval"], strict=True))
+    assert {name: written[name] for name in bounds} == {name: " to ".join(pair) for name, pair in bounds.items()}
 
 
 def test_published_rows_are_the_papers_with_the_mean_of_their_columns() -> None:
