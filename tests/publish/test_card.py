@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from card_of_run import (
     CAMERA,
+    LAYOUT,
     NAME,
     OPTIONS,
     ROWS,
@@ -56,6 +57,12 @@ def test_the_hub_reads_the_metadata(data: Path, kind: str) -> None:
     assert ("LeRobot" in metadata["tags"]) == (kind == "lerobot")
     first = metadata["configs"][0]
     assert first["data_files"] == ("data/*/*.parquet" if kind == "lerobot" else "manifest.parquet")
+
+
+def test_the_yield_counts_episodes_that_were_not_replayed(data: Path) -> None:
+    write_rows(data, [*ROWS, row("layout", LAYOUT, task=BOWL, reason="object_in_collision", steps=None)])
+    lost = "goal_not_reached 1, object_in_collision 1"
+    assert cells(written(data, "rlds"), "layout", "Yield") == ["3", "2", "1", "33%", lost, "tracked 1"]
 
 
 def test_tables_say_what_the_manifest_says(data: Path) -> None:
