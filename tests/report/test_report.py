@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.axes import AXES, Perturbation, to_json
+from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.report_data import KeptPerturbation, Strips
 from pipeline.config import Config, RenderConfig
 from pipeline.errors import PipelineError
@@ -172,6 +173,17 @@ def test_a_combination_counts_with_each_of_its_axes() -> None:
     assert shown["camera"][camera.level - 1] == ("2/3", 2 / 3)
     assert shown["light"][light.level - 1] == ("2/2", 1.0)
     assert all(cell == ("-", None) for at, cell in enumerate(shown["light"], 1) if at != light.level)
+
+
+def test_yields_stand_under_their_levels() -> None:
+    rows: list[dict[str, Any]] = []
+    for level, kept in ((1, True), (1, True), (1, False), (5, True), (5, False)):
+        camera = CameraPerturbation(component="spherical", level=level, azimuth_deg=20)
+        row = {"perturbations": to_json([camera]), "kept": kept, "reason": "kept" if kept else "too_dark"}
+        rows.append({**row, "steps": 9, "chosen": True})
+    table = yields.by_level("", rows)
+    assert table.head == ("level", "1", "2", "3", "4", "5")
+    assert [[cell.text for cell in cells] for cells in table.rows] == [["camera", "2/3", "-", "-", "-", "1/2"]]
 
 
 def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
