@@ -63,6 +63,14 @@ def test_pairs_reuse_the_perturbations_and_initial_states_of_their_singles() -> 
         some_pairs(subset=10)
 
 
+def test_one_initial_state_of_each_task_has_every_level_equally_often() -> None:
+    """A suite has ten tasks, of which two have each of the five levels."""
+    tasks = select(Selection(source="pairs", suites=(STOVE.suite,), axes=("robot", "noise"), episodes=1))
+    joined = [task for task in tasks if task.axis == "robot+noise"]
+    assert len({task.base for task in joined}) == 10
+    assert Counter(task.level for task in joined) == {1: 2, 2: 2, 3: 2, 4: 2, 5: 2}
+
+
 def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tasks = some_pairs(axes=("robot", "noise"), episodes=4)
     for task in tasks:
