@@ -3,11 +3,13 @@
 import json
 from collections import Counter
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 from conftest import STOVE
 from episode_results import analyze, result
 
@@ -17,7 +19,7 @@ from pipeline.evaluation import composition
 from pipeline.evaluation.composition import Pair
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.held_out import sample_perturbation
-from pipeline.evaluation.results import EpisodeFiles, stored
+from pipeline.evaluation.results import EpisodeFiles, Stored, stored
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 
@@ -96,6 +98,42 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
     EpisodeFiles(tmp_path).save(result(tasks[0], True, "q"))
     assert analyze("gap", str(tmp_path)) == 1
     assert "several policies" in capsys.readouterr().err
+
+
+def test_initial_states_are_resampled_with_both_levels_within_their_base_tasks(tmp_path: Path) -> None:
+    """Three base tasks have six initial states each, and the outcomes of an initial state are equal at two levels."""
+    axes = ("clean", "robot", "noise", "robot+noise")
+    successes_of = np.array(
+        [
+            [[1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 0, 0]],
+            [[1, 0, 0, 0], [1, 0, 1, 0], [0, 0, 0, 0], [1, 0, 0, 0], [1, 1, 0, 0], [1, 0, 0, 0]],
+            [[1, 1, 0, 0], [1, 0, 1, 0], [1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0], [1, 1, 1, 0]],
+        ]
+    )
+    results: list[Stored] = []
+    for base, of_base in zip(("a", "b", "c"), successes_of.tolist(), strict=True):
+        for number, successes in enumerate(of_base):
+            outcome_of = dict(zip(axes, successes, strict=True))
+            clean = EvaluationTask("libero", STOVE.suite, base, f"{base}{number}", "clean", "clean", 0, number)
+            results.append((result(clean, bool(outcome_of.pop("clean"))), EpisodeFiles(tmp_path)))
+            for level, axis in product((1, 3), outcome_of):
+                name = f"{base}{number} {axis} {level}"
+                task = EvaluationTask("own", STOVE.suite, base, name, axis, axis, level, number)
+                results.append((result(task, bool(outcome_of[axis])), EpisodeFiles(tmp_path)))
+    (pair,) = composition.pairs(results)
+    assert pair.trials == 36
+    assert pair.interval is not None
+    assert pair.interval.resampled == "18 trials within 3 base tasks"
+    # Five of six initial states are sampled within each base task; 15 degrees of freedom widen the percentiles.
+    picks = np.random.default_rng(1).integers(6, size=(3, 20_000, 5))
+    sums = sum(of_base[pick].sum(axis=1) for of_base, pick in zip(successes_of, picks, strict=True))
+    _, only_one, only_other, both = sums.T
+    whole = sums.sum(axis=1)
+    gaps = both / whole - (only_one + both) * (only_other + both) / whole**2
+    outside = scipy.stats.norm.cdf(scipy.stats.t.ppf(0.025, 15))
+    assert (pair.interval.low, pair.interval.high) == pytest.approx(
+        tuple(np.quantile(gaps, (outside, 1 - outside))), abs=0.003
+    )
 
 
 def test_the_gap_leaves_out_a_pair_of_other_perturbations_than_its_singles(tmp_path: Path) -> None:
