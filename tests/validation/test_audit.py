@@ -13,6 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import yaml
+from conftest import REPOSITORY
 from libero.libero.envs import TASK_MAPPING
 from scipy.spatial.transform import Rotation
 from synthetic import IDS, NAME, episode, loop, records
@@ -158,7 +160,7 @@ def test_what_lost_its_labels_is_known_by_its_instruction_and_by_a_manifest(
     assert (found.unlabelled, found.without_camera, found.unknown["robot"]) == (6, 6, 6)
     found = audit(edited, test, manifest)
     assert {axis: one.overlaps for axis, one in found.axes.items()} == {"language": 1, "noise": 1}
-    assert found.unlabelled == 0
+    assert (found.unlabelled, found.without_camera) == (0, 0)
 
 
 def test_episodes_without_labels_hide_all_axes_but_those_that_instructions_and_cameras_show() -> None:
@@ -179,6 +181,37 @@ def test_a_set_of_instructions_alone(test: TestSet, tmp_path: Path) -> None:
     language = found.axes["language"]
     assert (language.rows, language.overlaps, language.closest, language.smallest) == (2, 1, "episode 1", 0.0)
     assert found.without_task == 2
+
+
+def test_a_packed_rewrite_identifies_its_task(test: TestSet, tmp_path: Path) -> None:
+    """The text is no instruction of LIBERO."""
+    packed = yaml.safe_load((REPOSITORY / "pipeline" / "axes" / "language_bank.yaml").read_text())
+    (text, *_), *_ = packed[TASK.suite][TASK.name].values()
+    meta = tmp_path / "meta" / "episodes" / "chunk-000"
+    meta.mkdir(parents=True)
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    pq.write_table(pa.Table.from_pylist([{"episode_index": 0, "tasks": [text]}]), meta / "file-000.parquet")
+    found = audit(tmp_path, test)
+    assert found.without_task == 0
+    # Only the test instructions of this task are compared with the text.
+    assert found.axes["language"].comparisons == len(test.on(TASK, "language"))
+
+
+def test_a_camera_without_a_known_task_is_compared_in_the_arena_where_it_is_nearest(
+    datasets: Path, test: TestSet, tmp_path: Path
+) -> None:
+    edited = tmp_path / "edited"
+    shutil.copytree(datasets / "lerobot_v21", edited)
+    (lines,) = edited.rglob("episodes.jsonl")
+    episodes = [json.loads(line) for line in lines.read_text().splitlines()]
+    lines.write_text("".join(f"{json.dumps({**one, 'tasks': ['fold the towel']})}\n" for one in episodes))
+    (provenance,) = edited.rglob("provenance.parquet")
+    write_table(pq.read_table(provenance).drop_columns(["suite", "task"]), provenance)
+    found = audit(edited, test)
+    assert found.without_task == len(IDS)
+    camera = found.axes["camera"]
+    assert (camera.overlaps >= 1, camera.closest) == (True, CAMERA)
+    assert camera.smallest == pytest.approx(0.0, abs=1e-3)
 
 
 def test_an_episode_without_a_text_and_one_of_an_unknown_suite_are_counted(
