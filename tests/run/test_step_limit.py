@@ -57,6 +57,18 @@ def test_the_wine_bottle_is_marked_and_reported(replayed: tuple[Row, TrajectoryS
     assert counts.beyond_step_limit([told | {"exceeds_step_limit": False}]) == []
 
 
+def test_the_reported_episode_is_the_longest_for_its_limit() -> None:
+    """530 steps are 1.02 times the limit of the long suite, 347 steps 1.16 times that of the goal suite."""
+    rows = [
+        {"suite": suite, "task": "a", "steps": steps, "kept": True, "exceeds_step_limit": True}
+        for suite, steps in (("libero_10", 530), ("libero_goal", 347))
+    ]
+    for listed in (rows, rows[::-1]):
+        (sentence,) = counts.beyond_step_limit(listed)
+        assert sentence.startswith("2 kept episodes take more control steps")
+        assert "at most 347 of 300, in libero_goal/a" in sentence
+
+
 def test_a_run_that_asks_for_it_drops_the_wine_bottle(replayed: tuple[Row, TrajectoryStore]) -> None:
     row, store = replayed
     name = row.trajectory_id
