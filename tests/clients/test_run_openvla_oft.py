@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import datasets_in
-from tiny_recipe import NAME, SUITES, export_config, tiny_recipe
+from tiny_recipe import NAME, SUITES, export_config, row, tiny_recipe
 
 from pipeline.clients.recipe import write
 from pipeline.clients.templates.run_openvla_oft import condition, join_conditions
@@ -232,6 +232,15 @@ def test_openvla_oft_continues_under_the_statistics_of_a_checkpoint(trained: Pat
     assert done.returncode == 1
     assert "has no statistics for libero_" in done.stderr
     assert "it has: bridge" in done.stderr
+
+
+def test_a_condition_on_a_level_accepts_a_run_of_joint_levels_alone(tmp_path: Path) -> None:
+    joint = row("libero_10", "camera+noise") | {"component": "distance+gauss", "level": "1+3"}
+    offered = tiny_recipe(tmp_path, rows=[joint])["dataset"]["labels"]["value"]
+    for level in ("1", "3"):
+        assert join_conditions([condition(f"level={level}")], offered) == {"level": (level,)}
+    with pytest.raises(SystemExit, match="no episode has the level 2"):
+        join_conditions([condition("level=2")], offered)
 
 
 def test_conditions_are_labels_and_their_values() -> None:
