@@ -379,6 +379,21 @@ def test_an_overlap_is_explained_by_what_overlaps() -> None:
         leakage.reject_overlap(leakage.check(rows, test))
 
 
+@pytest.mark.parametrize("first", ["target", "scene"])
+def test_the_reported_clearance_is_that_of_the_closest_kind(first: str) -> None:
+    """A moved target at 6 mm is nearer to the test task than a moved scene at 20 mm; neither overlaps."""
+    task = find_task("libero_goal", "turn_on_the_stove")
+    test = TestSet((TestTask(task.suite, task.name, "name", "pose", "pose", {"moves": "plate_1:0,0"}),))
+    changed = {"axis": "pose", "level": 1}
+    target = {**changed, "component": "target", "moved": "plate_1", "dx_m": 0.006, "dy_m": 0, "dyaw_deg": 0}
+    scene = {**changed, "component": "scene", "moves": [{"name": "plate_1", "dx_m": 0.02, "dy_m": 0}]}
+    listed = sorted((target, scene), key=lambda fields: fields["component"] != first)
+    rows = [row(task, from_json(json.dumps([fields])), str(fields["component"])) for fields in listed]
+    found = leakage.check(rows, test)["pose"]
+    assert (found.overlaps, found.closest, found.clearance) == (0, "target", 0.005)
+    assert found.smallest == pytest.approx(0.006)
+
+
 def test_no_overlap_is_no_error(test: TestSet) -> None:
     leakage.reject_overlap({})
     tested = test.on_axis("noise")[0]

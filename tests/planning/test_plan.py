@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 import pytest
@@ -91,6 +91,25 @@ def test_equal_weights_spread_evenly_with_the_first_ahead(wanted: int, number: i
     """As plans before weights were spread: quotient for every task, and one more for as many as the remainder."""
     quotient, remainder = divmod(wanted, number)
     assert plan.apportion(wanted, [1.0] * number) == [quotient + (place < remainder) for place in range(number)]
+
+
+@pytest.mark.parametrize(("wanted", "reserve", "candidates"), [(1, 0.3, 2), (4, 0.3, 6), (2, 0.5, 3), (3, 0.0, 3)])
+def test_a_reserve_is_rounded_up(wanted: int, reserve: float, candidates: int) -> None:
+    demos = [demo for demo in entries(2) if demo.task == TASKS[0]]
+    one = config(axes=Axes(noise=NoiseAxis()), episodes={"noise": wanted}, reserve=reserve)
+    perturbed = [row for row in plan.make(demos, one, REPLAY, NO_TESTS) if row.role == "perturbed"]
+    assert (len(perturbed), sum(row.wanted for row in perturbed)) == (candidates, wanted)
+    from_resets = [row for row in plan.resets(demos, wanted, reserve, 0, REPLAY) if row.role == "perturbed"]
+    assert (len(from_resets), sum(row.wanted for row in from_resets)) == (candidates, wanted)
+
+
+def test_demonstrations_are_counted_for_the_task_with_most() -> None:
+    rows_of_tasks: list[list[plan.Row]] = []
+    for task, number in ((TASKS[0], 2), (TASKS[1], 5), (tasks("libero_object")[0], 3)):
+        demos = [DemoEntry(task, f"demo_{n}", "test", "human", f"{task.name}/{n}", steps=100) for n in range(number)]
+        rows_of_tasks.append(plan.twins(demos, 0, REPLAY))
+    for listed in (rows_of_tasks, rows_of_tasks[::-1]):
+        assert plan.count_demonstrations([*chain(*listed)]) == {"libero_goal": 5, "libero_object": 3}
 
 
 def test_round_trip(tmp_path: Path) -> None:
