@@ -26,6 +26,7 @@ from pipeline.evaluation.other_programs import separate
 from pipeline.evaluation.results import EpisodeResult, read
 from pipeline.evaluation.statistics import wilson
 from pipeline.evaluation.tasks import carried_task
+from pipeline.evaluation.tested import Outcome
 from pipeline.files import write as write_file
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import select_tasks
@@ -144,10 +145,7 @@ def attempts(paths: Sequence[Path]) -> list[Attempt]:
     for policy in policies:
         if policy.black != "none" or "blank" in (policy.prompt or ""):
             raise _without_observation(policy.name, paths)
-        for outcome in policy.outcomes:
-            test = benchmark.load().find(outcome.suite, outcome.name)
-            task = f"{test.suite}/{test.base}"
-            listed.append(Attempt(policy.name, (test.axis,), level_of_test(test), task, not outcome.success))
+        listed += [_attempt_on_test(policy.name, outcome) for outcome in policy.outcomes]
     return listed
 
 
@@ -163,6 +161,8 @@ def _without_observation(name: str, paths: Sequence[Path]) -> PipelineError:
 
 def _attempt(policy: str, row: EpisodeResult) -> Attempt | None:
     """Return the attempt of a result; ``None`` for the source ``goals`` if no plan can train its goal."""
+    if row.source == "libero_plus":
+        return _attempt_on_test(policy, row)
     task = f"{row.suite}/{row.base}"
     if row.source == "goals":
         carried = carried_task(row)
@@ -171,6 +171,15 @@ def _attempt(policy: str, row: EpisodeResult) -> Attempt | None:
         task = str(carried)
     axes = () if row.axis == "clean" else tuple(row.axis.split("+"))
     return Attempt(policy, axes, row.level if len(axes) == 1 else 0, task, not row.success)
+
+
+def _attempt_on_test(policy: str, outcome: EpisodeResult | Outcome) -> Attempt:
+    """Return the attempt at a test task, with axis and level from the benchmark.
+
+    A result of an earlier version may have another level.
+    """
+    test = benchmark.load().find(outcome.suite, outcome.name)
+    return Attempt(policy, (test.axis,), level_of_test(test), f"{test.suite}/{test.base}", not outcome.success)
 
 
 def focus(config: Config, results: Sequence[Attempt], episodes: int | None, limits: Limits = Limits()) -> Focused:

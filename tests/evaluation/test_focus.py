@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,15 @@ def test_levels_and_tasks_get_shares_too() -> None:
     assert focused.task_weights == {STOVE: 0.5, BOWL: 1.5}, "the floor, and what remains"
     level = reasons(focused, "level")["camera 1"]
     assert (level.before, level.note) == (0.2, "floor")
+
+
+def test_rates_of_levels_are_smoothed_towards_the_rate_of_their_axis() -> None:
+    """4 of 40 camera tests fail and 32 of 40 robot tests, so the mean rate is 37/82."""
+    results = [*attempt("camera", 4, 20, level=1), *attempt("camera", 0, 20, level=5), *attempt("robot", 32, 40)]
+    levels = reasons(focus(config(), results, None), "level")
+    of_camera = (4 + 5 * 37 / 82) / 45
+    rates = {level: levels[f"camera {level}"].rate for level in (1, 3, 5)}
+    assert rates == pytest.approx({1: (4 + 5 * of_camera) / 25, 3: of_camera, 5: 5 * of_camera / 25})
 
 
 def test_levels_that_do_not_set_shares_stay() -> None:
@@ -171,11 +181,15 @@ def test_equal_weights_spread_evenly() -> None:
 
 
 def evaluated(folder: Path) -> Path:
-    """Write results of ``evaluate`` on 20 camera and 20 robot tests; half of the robot tests fail."""
+    """Write results of ``evaluate`` on 20 camera and 20 robot tests, by turns at levels 2 and 4.
+
+    Half of the robot tests fail.
+    """
     for axis in ("camera", "robot"):
         tests = [test for test in benchmark.load().on_axis(axis) if test.suite == "libero_goal"]
-        for number, test in enumerate(tests[:20]):
-            level = 2 + 2 * (number % 2)
+        weak, strong = ([test for test in tests if level_of_test(test) == level][:10] for level in (2, 4))
+        for number, test in enumerate(chain.from_iterable(zip(weak, strong, strict=True))):
+            level = level_of_test(test)
             task = EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, level, 0)
             EpisodeFiles(folder).save(result(task, axis == "camera" or number < 10))
     return folder
@@ -273,6 +287,15 @@ def test_results_of_other_programs_count_as_those_of_evaluate(tmp_path: Path) ->
     assert len(attempts([tmp_path / "own", tmp_path / "eval_info.json"])) == 60
     with pytest.raises(PipelineError, match="two policies have the name"):
         attempts([tmp_path, tmp_path / "eval_info.json"])
+
+
+def test_a_level_of_an_earlier_version_does_not_count(tmp_path: Path) -> None:
+    """The robot's posture 300 differs by 0.3 rad from the default, which is level 3."""
+    test = next(one for one in benchmark.load().on_axis("robot") if one.parameters["id"] == 300)
+    for number, old_level in enumerate((1, 3, 5)):
+        task = EvaluationTask("libero_plus", test.suite, test.base, test.name, "robot", test.component, old_level, 0)
+        EpisodeFiles(tmp_path).save(result(task, policy=f"policy {number}"))
+    assert [(episode.axes, episode.level) for episode in attempts([tmp_path])] == [(("robot",), 3)] * 3
 
 
 def test_weights_of_tasks_shift_their_episodes(tmp_path: Path) -> None:
