@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.axes import AXES, Perturbation, to_json
+from pipeline.axes.base import Level
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.report_data import KeptPerturbation, Strips
 from pipeline.config import Config, RenderConfig
@@ -176,8 +177,9 @@ def test_a_combination_counts_with_each_of_its_axes() -> None:
 
 
 def test_yields_stand_under_their_levels() -> None:
+    outcomes: list[tuple[Level, bool]] = [(1, True), (1, True), (1, False), (5, True), (5, False)]
     rows: list[dict[str, Any]] = []
-    for level, kept in ((1, True), (1, True), (1, False), (5, True), (5, False)):
+    for level, kept in outcomes:
         camera = CameraPerturbation(component="spherical", level=level, azimuth_deg=20)
         row = {"perturbations": to_json([camera]), "kept": kept, "reason": "kept" if kept else "too_dark"}
         rows.append({**row, "steps": 9, "chosen": True})
