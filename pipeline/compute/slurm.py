@@ -120,11 +120,13 @@ def slurm_jobs(compute_config: ComputeConfig, folder: Path) -> Iterator[SlurmJob
         folder: folder that the work writes into; the nodes must see it too.
 
     Raises:
-        PipelineError: if SLURM rejects the job, or the path of the folder contains a space.
+        PipelineError: if SLURM rejects the job, or the path of the folder needs quotes.
     """
-    _reject_spaces(folder)
+    _reject_unquoted(folder)
     logs = (folder / LOGS).absolute()
     workers = compute_config.workers or 1
+    for left_by_a_kill in logs.glob(".dask-jobqueue.worker.*"):
+        left_by_a_kill.unlink()
     # Jobs read a certificate of this run in its folder. Programs without it cannot run code in the workers.
     with _cluster(compute_config, logs, security=True, shared_temp_directory=str(logs)) as cluster:
         _try(cluster.job_script())
@@ -141,21 +143,22 @@ def check_job(compute_config: ComputeConfig, folder: Path) -> None:
         folder: folder that the work would write into.
 
     Raises:
-        PipelineError: if SLURM rejects the job or is not installed, or if the path of the folder contains a space.
+        PipelineError: if SLURM rejects the job or is not installed, or if the path of the folder needs
+            quotes.
     """
-    _reject_spaces(folder)
+    _reject_unquoted(folder)
     with TemporaryDirectory() as logs, _cluster(compute_config, Path(logs)) as cluster:
         _try(cluster.job_script())
 
 
-def _reject_spaces(folder: Path) -> None:
-    """Raise a ``PipelineError`` for a path with a space, which dask-jobqueue does not quote in a job's script."""
+def _reject_unquoted(folder: Path) -> None:
+    """Raise a ``PipelineError`` for a path that a shell would change, as dask-jobqueue does not quote it in a job."""
     path = str(folder.absolute())
-    if len(path.split()) != 1:
+    if quote(path) != path:
         raise PipelineError(
-            "the path of the run's folder contains a space, which the script of a SLURM job cannot have",
+            "the path of the run's folder contains a space or another character that a SLURM job's script cannot have",
             where=path,
-            remedy="set folder to a path without spaces",
+            remedy="set folder to a path of letters, digits and any of _ . - /",
         )
 
 
@@ -207,7 +210,9 @@ def _of_site(name: str, former_name: str) -> list[str]:
 def _scheduler_of_site() -> dict[str, Any]:
     import dask
 
-    return dict(dask.config.get("jobqueue.slurm.scheduler-options", None) or {})
+    options = dict(dask.config.get("jobqueue.slurm.scheduler-options", None) or {})
+    options.pop("protocol", None)  # certificates need TLS
+    return options
 
 
 def _queued() -> set[str] | None:

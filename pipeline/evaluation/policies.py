@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -463,14 +464,31 @@ def _reject_foreign_steps(folder: Path) -> None:
     """Raise a ``PipelineError`` if a checkpoint names a foreign step, which lerobot would import and call."""
     for file in sorted(folder.glob("policy_*processor.json")):
         for step in read_json(file, "name a folder that lerobot saved a policy in").get("steps", []):
-            name = step.get("class", "")
-            if "registry_name" not in step and not name.startswith("lerobot."):
+            if not _is_of_lerobot(step):
                 raise PipelineError(
-                    f"a step of the policy is the class {name!r}, which lerobot would import and call",
+                    f"{step!s:.200} is not a step of lerobot, and lerobot would import and call it",
                     where=file,
                     expected="steps of lerobot",
                     remedy="if you trust this code, serve the policy (docs/model-server.md)",
                 )
+
+
+def _is_of_lerobot(step: Any) -> bool:
+    """Return whether a step has a registered name or names a class of lerobot for steps."""
+    from lerobot.processor import ProcessorStep
+
+    if not isinstance(step, dict):
+        return False
+    if "registry_name" in step:
+        return True
+    module, _, name = str(step.get("class")).rpartition(".")
+    if not module.startswith("lerobot."):
+        return False
+    try:
+        found = getattr(import_module(module), name, None)
+    except ImportError:
+        return False
+    return isinstance(found, type) and issubclass(found, ProcessorStep)
 
 
 COMPARED_TENSORS = 20

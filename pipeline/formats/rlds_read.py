@@ -6,8 +6,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from google.protobuf import json_format
-
 from pipeline.episode_schema import MATRICES, SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
@@ -182,7 +180,7 @@ def _places(shards: tuple[Edition, ...]) -> dict[str, Place]:
 def _info(folder: Path) -> Any:
     try:
         return _opened(edition(folder / "dataset_info.json"))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, json_format.Error) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError) as error:
         raise PipelineError(
             f"{type(error).__name__}: {error}", where=folder, expected="a set that TFDS opens", remedy=MAKE_AGAIN
         ) from error

@@ -1,8 +1,9 @@
 """TFRecord files without TensorFlow: the framing of records, and examples as flat columns."""
 
-import json
 import struct
+import sys
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import google_crc32c
 import numpy as np
 import tensorflow_datasets as tfds
+from google.protobuf import json_format
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
@@ -18,9 +20,6 @@ from pipeline.errors import PipelineError
 METADATA = "episode_metadata/"
 """Prefix of columns with one value for the whole episode."""
 
-
-FEATURE_CLASSES = "tensorflow_datasets.core.features."
-"""Start of the names of TFDS's own classes of features."""
 
 OVERHEAD_BYTES = 16
 """Bytes that the framing adds to a record."""
@@ -97,35 +96,31 @@ def _damaged(shard: Path, index: int) -> PipelineError:
 def info_of(folder: Path) -> Any:
     """Open the description of an RLDS dataset, ``folder`` being that of its version.
 
+    TFDS imports the modules of the classes that ``features.json`` names. No file near the dataset is imported.
+
     Returns:
         A ``tfds.core.DatasetInfo``.
 
     Raises:
-        PipelineError: if ``features.json`` names a class that is not TFDS's own. TFDS would import its module, which
-            may be a file of the dataset.
-        OSError, ValueError: if a file is missing or damaged, as TFDS raises them.
+        OSError, ValueError: if a file is missing or damaged, or names an unknown class, as TFDS raises them.
     """
-    file = folder / "features.json"
-    for name in _classes_in(json.loads(file.read_text())):
-        if not name.startswith(FEATURE_CLASSES):
-            raise PipelineError(
-                f"a feature has the class {name!r}, whose module would be imported",
-                where=file,
-                expected=f"classes of TFDS, {FEATURE_CLASSES}*",
-            )
-    return tfds.builder_from_directory(folder).info
+    try:
+        with _no_modules_around(folder):
+            return tfds.builder_from_directory(folder).info
+    except json_format.Error as error:
+        raise ValueError(f"features.json or dataset_info.json: {error}") from error
 
 
-def _classes_in(content: Any) -> Iterator[str]:
-    """Yield the names of classes at any depth of the content of ``features.json``."""
-    if isinstance(content, list):
-        for value in content:
-            yield from _classes_in(value)
-    if isinstance(content, dict):
-        for name, value in content.items():
-            if name in ("pythonClassName", "type") and isinstance(value, str):  # earlier versions wrote `type`
-                yield value
-            yield from _classes_in(value)
+@contextmanager
+def _no_modules_around(folder: Path) -> Iterator[None]:
+    """Leave the folders that contain ``folder`` out of ``sys.path``, such as the working folder of ``python -m``."""
+    searched = sys.path[:]
+    inside = folder.resolve()
+    sys.path[:] = [entry for entry in searched if not inside.is_relative_to(Path(entry).resolve())]
+    try:
+        yield
+    finally:
+        sys.path[:] = searched
 
 
 def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:

@@ -19,6 +19,7 @@ Fact = tuple[str, ...]
 
 _ARENA = re.compile(rf"libero_({'|'.join(get_args(Arena))})(?:_tabletop)?_manipulation")
 _PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII)
 _LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
 
 
@@ -383,14 +384,12 @@ def _reject_expressions(tokens: list[Any], where: object) -> None:
             continue
         if part[0] == ":yaw_rotation":
             for value in chain.from_iterable(part[1]):
-                try:
-                    float(value)
-                except ValueError as error:
+                if not _NUMBER.fullmatch(value):
                     raise PipelineError(
                         f":yaw_rotation has {value!r}, and LIBERO would run it as Python code",
                         where=where,
                         expected="two numbers in radians, such as (:yaw_rotation ((0.0 1.57)))",
-                    ) from error
+                    )
         _reject_expressions(part, where)
 
 

@@ -55,11 +55,15 @@ class LanguageModel:
 
     def __post_init__(self) -> None:
         """Check the endpoint's address and the key, which an error does not show."""
-        address = urllib.parse.urlsplit(self.endpoint)
-        if address.scheme not in ("http", "https") or not address.hostname:
+        try:
+            address = urllib.parse.urlsplit(self.endpoint)
+            is_address = address.scheme in ("http", "https") and bool(address.hostname)
+        except ValueError:
+            is_address = False
+        if not is_address:
             raise PipelineError(
                 "the endpoint is not an address",
-                where=f"endpoint {self.endpoint!r}",
+                where=f"endpoint {_without_secrets(self.endpoint)!r}",
                 expected="such as http://localhost:8000/v1",
             )
         if not PRINTABLE.fullmatch(_key()):
@@ -88,7 +92,7 @@ class LanguageModel:
                 wait_s *= 2
         raise PipelineError(
             f"no answer in {ATTEMPTS} attempts: {'; '.join(dict.fromkeys(faults))}",
-            where=self._shown_url,
+            where=_without_secrets(self._url),
             remedy="check that the server runs and keeps up, then run the command again: accepted rewrites are kept",
         )
 
@@ -96,12 +100,6 @@ class LanguageModel:
     def _url(self) -> str:
         """Address for chat completions."""
         return f"{self.endpoint.rstrip('/')}/chat/completions"
-
-    @property
-    def _shown_url(self) -> str:
-        """Address for messages, without the password and the query, which may be secret."""
-        address = urllib.parse.urlsplit(self._url)
-        return address._replace(netloc=address.netloc.rpartition("@")[2], query="").geturl()
 
     def _post(self, prompt: str) -> bytes:
         """Send a prompt once and return the body of the answer.
@@ -128,7 +126,9 @@ class LanguageModel:
                         raise TimeoutError(f"no whole answer within {self.timeout_s:g} s")
         except (httpx.InvalidURL, ImportError, ValueError) as error:  # a proxy in the environment raises the last two
             raise PipelineError(
-                f"the endpoint cannot be asked ({error})", where=self._shown_url, expected="an http or https address"
+                f"the endpoint cannot be asked ({error})",
+                where=_without_secrets(self._url),
+                expected="an http or https address",
             ) from error
         except (OSError, httpx.HTTPError) as error:
             raise _BusyError(str(error) or type(error).__name__) from error
@@ -141,10 +141,15 @@ class LanguageModel:
             raise _BusyError(fault, float(retry_after) if re.fullmatch("[0-9]+", retry_after) else 0.0)
         raise PipelineError(
             f"the endpoint rejects the question ({fault})",
-            where=self._shown_url,
+            where=_without_secrets(self._url),
             expected=f"a chat completion by the model {self.model!r}",
             remedy="check the endpoint, the model's name and the environment variable OPENAI_API_KEY",
         )
+
+
+def _without_secrets(address: str) -> str:
+    """Return an address for messages: the part after user and password, without query and fragment."""
+    return re.split("[?#]", address.rpartition("@")[2])[0]
 
 
 def _key() -> str:

@@ -124,6 +124,8 @@ def scheduler_address(_: int) -> str:
 def test_jobs_are_connected_by_a_certificate_that_only_this_user_reads(slurm: Path, tmp_path: Path) -> None:
     compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(memory_gb=0.9))
     logs = tmp_path / "data" / ".work" / "slurm"
+    logs.mkdir(parents=True)
+    (logs / ".dask-jobqueue.worker.key.of_a_killed_run").touch()
     with runner(compute, tmp_path / "data") as work:
         (address,) = work(scheduler_address, [0], "address")
         modes = {file.stat().st_mode & 0o777 for file in logs.glob(".dask-jobqueue.*")}
@@ -146,7 +148,10 @@ def test_a_folder_with_a_space_is_rejected_by_doctor_and_run(slurm: Path, tmp_pa
         update={"compute": compute, "folder": tmp_path / "my runs"}
     )
     diagnosis = {finding.name: finding for finding in doctor.check(Run(config), 0.001)}["SLURM"]
-    assert (diagnosis.status, diagnosis.remedy) == ("fail", "set folder to a path without spaces")
+    assert (diagnosis.status, diagnosis.remedy) == (
+        "fail",
+        "set folder to a path of letters, digits and any of _ . - /",
+    )
 
 
 @pytest.mark.slow
@@ -193,7 +198,7 @@ def test_settings_of_the_site_and_of_the_run_apply(slurm: Path, tmp_path: Path) 
         job-extra-directives: ["--comment=of-the-site", "--time-min=1"]
         job-script-prologue: ["export SITE='module load'", "export LP_NUM_THREADS=7"]
         worker-extra-args: ["--resources", "licences=3"]
-        scheduler-options: {host: 127.0.0.1}
+        scheduler-options: {host: 127.0.0.1, protocol: "tcp://"}
         job-mem: 700M
     """
     compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(options=("--comment=of-the-run",)))

@@ -144,17 +144,28 @@ def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_rejected(
 
 
 def test_a_checkpoint_that_names_code_of_other_packages_is_rejected_before_it_runs(tmp_path: Path) -> None:
-    """lerobot imports and calls the classes that a checkpoint names."""
-    folder, ran = checkpoints.save(tmp_path, 0.25), tmp_path / "ran"
+    """lerobot imports and calls what a checkpoint names, its own functions that run a file too."""
+    folder, ran, code = checkpoints.save(tmp_path, 0.25), tmp_path / "ran", tmp_path / "code.py"
+    code.write_text(f"open({str(ran)!r}, 'w').close()")
+    foreign: list[Any] = [
+        {"class": "subprocess.Popen", "config": {"args": ["touch", str(ran)]}},
+        {"class": "lerobot.envs.utils._load_module_from_path", "config": {"path": str(code)}},
+        {"class": 3},
+        "no step",
+    ]
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         text = (folder / name).read_text()
-        saved = json.loads(text)
-        saved["steps"].append({"class": "subprocess.Popen", "config": {"args": ["touch", str(ran)]}})
-        (folder / name).write_text(json.dumps(saved))
-        with pytest.raises(PipelineError, match=rf"{name}: a step of the policy is the class 'subprocess\.Popen'"):
-            Checkpoint(folder)
+        for step in foreign:
+            saved = json.loads(text)
+            saved["steps"].append(step)
+            (folder / name).write_text(json.dumps(saved))
+            with pytest.raises(PipelineError, match=rf"{name}: .* is not a step of lerobot"):
+                Checkpoint(folder)
         assert not ran.exists()
-        (folder / name).write_text(text)
+        saved = json.loads(text)
+        own = {"class": "lerobot.processor.rename_processor.RenameObservationsProcessorStep", "config": {}}
+        saved["steps"].append(own)
+        (folder / name).write_text(text if "post" in name else json.dumps(saved))
     Checkpoint(folder)
 
 

@@ -338,10 +338,21 @@ def test_messages_show_neither_the_password_nor_the_query_of_an_endpoint(server:
     assert server.url.removeprefix("http://") in str(caught.value)
 
 
-@pytest.mark.parametrize("endpoint", ["localhost:8000", "file:///etc/passwd", "http://"])
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "localhost:8000",
+        "file:///etc/passwd",
+        "http://",
+        "me:secret@h:8000/v1",
+        "ftp://me:secret@h",
+        "http://me:secret@[::",
+    ],
+)
 def test_an_endpoint_that_is_no_address_is_rejected(endpoint: str) -> None:
-    with pytest.raises(PipelineError, match="not an address"):
+    with pytest.raises(PipelineError, match="not an address") as caught:
         LanguageModel(endpoint, "tiny")
+    assert "secret" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import arenas
 import numpy as np
@@ -305,9 +305,19 @@ def test_the_command_ends_with_1_where_something_overlaps(
     assert said["axes"]["camera"]["overlaps"] == 1
 
 
-@pytest.mark.parametrize("key", ["pythonClassName", "type"])
+SEQUENCE = {"pythonClassName": "tensorflow_datasets.core.features.sequence_feature.Sequence"}
+
+
+@pytest.mark.parametrize(
+    "feature",
+    [
+        {"pythonClassName": "downloaded.Feature"},
+        {"python_class_name": "downloaded.Feature", "text": {}},
+        SEQUENCE | {"jsonFeature": {"json": json.dumps({"feature": {"type": "downloaded.Feature", "content": {}}})}},
+    ],
+)
 def test_code_that_a_dataset_names_is_not_run(
-    key: str, datasets: Path, test: TestSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    feature: dict[str, Any], datasets: Path, test: TestSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """TFDS imports the module of each feature's class, and a module may be a file of a downloaded dataset."""
     monkeypatch.syspath_prepend(tmp_path)
@@ -315,11 +325,14 @@ def test_code_that_a_dataset_names_is_not_run(
     (source,) = {file.parent for file in datasets.rglob("features.json")}
     version = shutil.copytree(source, tmp_path / "set" / "1.0.0")
     content = json.loads((version / "features.json").read_text())
-    content["featuresDict"]["features"]["extra"] = {key: "downloaded.Feature"}
-    (version / "features.json").write_text(json.dumps(content))
-    with pytest.raises(PipelineError, match=r"features\.json: a feature has the class 'downloaded\.Feature'"):
-        audit(tmp_path / "set", test)
-    assert not (tmp_path / "ran").exists()
+    content["featuresDict"]["features"]["extra"] = feature
+    legacy = {"type": "downloaded.Feature", "content": "{}"}
+    for written in (content, legacy, {"unknown": 1}):
+        (version / "features.json").write_text(json.dumps(written))
+        with pytest.raises(PipelineError, match="cannot be read"):
+            audit(tmp_path / "set", test)
+        assert not (tmp_path / "ran").exists()
+        assert str(tmp_path) in sys.path
 
 
 def test_a_folder_without_a_dataset_is_rejected(tmp_path: Path, test: TestSet) -> None:
