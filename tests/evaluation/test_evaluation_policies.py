@@ -162,10 +162,16 @@ def test_a_checkpoint_that_names_code_of_other_packages_is_rejected_before_it_ru
             with pytest.raises(PipelineError, match=rf"{name}: .* is not a step of lerobot"):
                 Checkpoint(folder)
         assert not ran.exists()
-        saved = json.loads(text)
-        own = {"class": "lerobot.processor.rename_processor.RenameObservationsProcessorStep", "config": {}}
-        saved["steps"].append(own)
-        (folder / name).write_text(text if "post" in name else json.dumps(saved))
+        (folder / name).write_text(text)
+
+
+def test_a_checkpoint_may_name_a_class_of_lerobot(tmp_path: Path) -> None:
+    """As lerobot does for its steps without a registered name."""
+    folder = checkpoints.save(tmp_path, 0.25)
+    file = folder / "policy_preprocessor.json"
+    saved = json.loads(file.read_text())
+    own = {"class": "lerobot.processor.rename_processor.RenameObservationsProcessorStep", "config": {}}
+    file.write_text(json.dumps({**saved, "steps": [*saved["steps"], own]}))
     Checkpoint(folder)
 
 

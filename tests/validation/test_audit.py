@@ -3,7 +3,7 @@
 import json
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -169,14 +169,19 @@ def test_episodes_without_labels_hide_all_axes_but_those_that_instructions_and_c
     assert result.unknown == hidden
 
 
-def test_a_set_of_instructions_alone(test: TestSet, tmp_path: Path) -> None:
-    meta = tmp_path / "meta" / "episodes" / "chunk-000"
+def write_instructions(texts: Sequence[str], folder: Path) -> None:
+    """Write what an audit reads of a LeRobot dataset that has one episode for each instruction, and no labels."""
+    meta = folder / "meta" / "episodes" / "chunk-000"
     meta.mkdir(parents=True)
-    (tmp_path / "meta" / "info.json").write_text("{}")
-    tested = str(test.on(TASK, "language")[3].parameters["text"])
-    texts = [TASK.instruction, f" {tested.upper()}!", "fold the towel and hang it over the chair by the window"]
+    (folder / "meta" / "info.json").write_text("{}")
     rows = [{"episode_index": index, "tasks": [text]} for index, text in enumerate(texts)]
     pq.write_table(pa.Table.from_pylist(rows), meta / "file-000.parquet")
+
+
+def test_a_set_of_instructions_alone(test: TestSet, tmp_path: Path) -> None:
+    tested = str(test.on(TASK, "language")[3].parameters["text"])
+    texts = [TASK.instruction, f" {tested.upper()}!", "fold the towel and hang it over the chair by the window"]
+    write_instructions(texts, tmp_path)
     found = audit(tmp_path, test)
     language = found.axes["language"]
     assert (language.rows, language.overlaps, language.closest, language.smallest) == (2, 1, "episode 1", 0.0)
@@ -187,10 +192,7 @@ def test_a_packed_rewrite_identifies_its_task(test: TestSet, tmp_path: Path) -> 
     """The text is no instruction of LIBERO."""
     packed = yaml.safe_load((REPOSITORY / "pipeline" / "axes" / "language_bank.yaml").read_text())
     (text, *_), *_ = packed[TASK.suite][TASK.name].values()
-    meta = tmp_path / "meta" / "episodes" / "chunk-000"
-    meta.mkdir(parents=True)
-    (tmp_path / "meta" / "info.json").write_text("{}")
-    pq.write_table(pa.Table.from_pylist([{"episode_index": 0, "tasks": [text]}]), meta / "file-000.parquet")
+    write_instructions([text], tmp_path)
     found = audit(tmp_path, test)
     assert found.without_task == 0
     # Only the test instructions of this task are compared with the text.
