@@ -127,6 +127,8 @@ def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
     [
         # Off the table.
         (PLATE, moved("plate_1", 1.0), "relation_broken"),
+        # Its centre is 9 mm past the table's edge: it tips.
+        (PLATE, moved("plate_1", 0.0, -0.6), "object_unstable"),
         (BETWEEN, moved(BOWL, 0.06), "object_in_collision"),
         (NEXT_TO, moved(BOWL, -0.03, 0.05), "relation_broken"),
         (BETWEEN, moved(BOWL, 0.0, 0.08), "relation_broken"),
@@ -157,6 +159,12 @@ def test_a_receptacle_moves_when_asked_for_and_the_targets_relation_still_holds(
 def test_small_moves_keep_the_relation(task: Task, scenes: Scenes) -> None:
     for change in (moved(BOWL, 0.01, -0.01, 4), moved(BOWL, -0.01, 0.01, -4)):
         change.apply(scenes(task), starter_demo(task), roll_out)
+
+
+def test_a_plate_may_stand_near_the_edge_of_the_table(scenes: Scenes) -> None:
+    near = moved("plate_1", 0.0, -0.56)
+    after = near.apply(scenes(PLATE), starter_demo(PLATE), roll_out)
+    assert CompiledScene(after).xy_m("plate_1")[1] == pytest.approx(-0.569, abs=1e-3)
 
 
 def touched(compiled: CompiledScene, thing: str) -> set[tuple[int, int]]:
