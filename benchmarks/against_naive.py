@@ -23,7 +23,7 @@ from libero_environment import OffScreenRenderEnv
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer
 from pipeline.compute.pool import loop
 from pipeline.config import Config, load
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, STANDARD
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_code
@@ -56,7 +56,7 @@ def main() -> None:
         render_plan(rows, config, TrajectoryStore(trajectories), FrameStore(frames, config.render), loop)
         rendered = time.process_time()
         store = FrameStore(frames, config.render)
-        outcome = selection.select(rows, verdicts, rejections(rows, frames_by_trajectory(store.rows())))
+        outcome = selection.select(rows, verdicts, rejections(rows, frames_by_trajectory(store.rows()), STANDARD.views))
         kept = [row for row in rows if outcome[row.episode_id].kept]
         naive_s, same, count = 0.0, 0, 0
         for row in kept:

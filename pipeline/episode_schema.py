@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from pipeline.files import schema_file
-from pipeline.types import Episode, Extra, Frozen
+from pipeline.types import Episode, Extra, Floats, Frozen
 
 
 class ViewSpec(Frozen):
@@ -106,6 +106,11 @@ class ActionSpec(VectorSpec):
     unit_rad: float
     gripper: GripperSpec
     controller: str
+
+    @property
+    def units(self) -> Floats:
+        """Motion (6,) that entries of 1 command: three in m, three in rad."""
+        return np.repeat([self.unit_m, self.unit_rad], 3)
 
 
 class EpisodeSchema(Frozen):

@@ -114,7 +114,7 @@ class ExportConfig(_Formats):
         formats = self.formats
         return [kind(folder, formats[kind.name], content) for kind in FORMATS if kind.name in formats]
 
-    def failure_datasets(self, folder: Path, content: Content = STANDARD) -> list[Format[Any]]:
+    def failure_datasets(self, folder: Path, content: Content) -> list[Format[Any]]:
         """List the datasets of failures of a run in ``folder``; the list is empty if failures are not requested."""
         if not self.failures:
             return []

@@ -91,8 +91,8 @@ def edits(folder: Path) -> dict[str, str]:
     """List the files that differ from the folder's record.
 
     Returns:
-        Path below the folder to ``changed``, ``added``, ``a link`` or ``without a record``. A deleted file is no edit:
-        generating it again loses nothing.
+        Path below the folder to ``changed``, ``added``, ``a link`` or ``without a record``; only the folder's name,
+        with ``not a folder``, if it is a link or a file. A deleted file is no edit: generating it again loses nothing.
     """
     if folder.is_symlink() or folder.is_file():
         return {folder.name: "not a folder"}

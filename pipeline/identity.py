@@ -19,7 +19,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
@@ -33,7 +33,7 @@ Step = Literal["physics", "pixels", "encoding", "evaluation", "checks", "picture
 RECIPES: dict[Step, int] = {
     "physics": 8,
     "pixels": 7,
-    "encoding": 5,
+    "encoding": 6,
     "evaluation": 4,
     "checks": 15,
     "pictures": 13,
@@ -98,7 +98,7 @@ VERSIONS = {
 @cache
 def versions() -> dict[str, str]:
     """Map the packages of ``VERSIONS`` to their installed versions."""
-    return {name: version(DISTRIBUTION if name == "pipeline" else name) for name in VERSIONS}
+    return {name: _version(DISTRIBUTION if name == "pipeline" else name) for name in VERSIONS}
 
 
 def made_with(step: Step) -> dict[str, str]:
@@ -180,5 +180,11 @@ def _version(package: str) -> str:
     """Return the version of an installed package.
 
     Every stage needs the versions of all formats' packages. Reading one takes 1 ms.
+
+    Raises:
+        PipelineError: when the package is not installed.
     """
-    return version(package)
+    try:
+        return version(package)
+    except PackageNotFoundError as error:
+        raise PipelineError(f"the package {package} is not installed", remedy=origins.REINSTALL) from error

@@ -7,7 +7,6 @@ call. The command ``run`` performs all stages in one process; each script in ``s
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 from rich.console import Console
@@ -97,7 +96,7 @@ def doctor(run: Run) -> None:
 
     try:
         tried = finished.trial_memory(run, gl.choose().device).holds()
-    except (PipelineError, PackageNotFoundError):
+    except PipelineError:
         # The table of `doctor_checks.run` reports missing packages.
         tried = False
     failed = doctor_checks.run(run, tried=tried)

@@ -10,7 +10,6 @@ from rich.table import Table
 
 from pipeline import stages
 from pipeline.config import Config
-from pipeline.episode_schema import STANDARD
 from pipeline.errors import PipelineError
 from pipeline.generated import FOLDERS, edits, edits_in_words
 from pipeline.planning import plan, selection
@@ -61,9 +60,16 @@ def describe(run: Run) -> Iterator[str | Table]:
     yield from edits_in_words(run.folder)
     yield _disk(run)
     # Count undecided candidates as kept until they are replayed.
-    possible = {key for key, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
-    needed = [row for row in rows if row.episode_id in possible]
+    needed = _shown(config, rows, judged, rejected)
+    needed += [row for row in rows if judged[row.episode_id].reason == selection.NOT_REPLAYED]
     yield from _time_left(run, needed, verdicts, frames, steps) if steps else ()
+
+
+def _shown(
+    config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str]
+) -> list[plan.Row]:
+    """List the episodes that have frames, or get frames in the stage ``render``."""
+    return [row for row in outcome.to_render(rows, judged, rejected, config.export) if row.episode_id not in rejected]
 
 
 def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict]) -> dict[str, counts.Target]:
@@ -113,9 +119,9 @@ def _steps(
     if needed:
         yield "replay", f"{len(needed)} trajectories are missing" + _of(generated_again, "trajectories")
     judged = selection.select(rows, verdicts, rejected)
-    to_render = [row for row in rows if judged[row.episode_id].kept]
-    to_render += [row for row in outcome.list_failures(rows, judged, config.export) if row.episode_id not in rejected]
-    missing = [row for row in to_render if not outcome.has_frames(row, frames, config.render.content.views)]
+    views = config.render.content.views
+    shown = _shown(config, rows, judged, rejected)
+    missing = [row for row in shown if not outcome.has_frames(row, frames, views)]
     if missing:
         yield "render", f"the frames of {len(missing)} episodes are missing" + _of(generated_again, "files of frames")
     if needed or missing or why_planned is not None:
@@ -193,7 +199,7 @@ def not_made(
     needed: Sequence[plan.Row],
     verdicts: Mapping[str, Verdict],
     frames: Mapping[str, StoredFrames],
-    views: tuple[str, ...] = STANDARD.views,
+    views: tuple[str, ...],
 ) -> dict[str, float]:
     """Return the shares in [0, 1] of the trajectories and streams that ``replay`` and ``render`` have yet to generate.
 

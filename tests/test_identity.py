@@ -15,6 +15,11 @@ from pipeline.errors import PipelineError
 from pipeline.stores.frame_store import FrameStore
 
 
+def test_a_missing_package_is_named() -> None:
+    with pytest.raises(PipelineError, match=r"the package no-such-package is not installed\n  try: mv \.venv"):
+        identity.made_with_recipe("a format", 1, ["no-such-package"])
+
+
 @pytest.mark.parametrize("step", identity.RECIPES)
 def test_another_recipe_repeats_its_step_and_all_that_build_on_it(step: identity.Step) -> None:
     before = {each: identity.fingerprint(each) for each in identity.RECIPES}

@@ -5,6 +5,7 @@ from dataclasses import replace
 from conftest import BOWL
 
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
+from pipeline.episode_schema import STANDARD
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.status import not_made
@@ -23,15 +24,15 @@ def test_what_is_left_is_counted_in_trajectories_and_streams() -> None:
     assert len(rows) == 15
     twin = rows[0].trajectory_id
     verdicts = {twin: Verdict(True, "kept")}
-    assert not_made(rows, {}, {}) == {"replay": 1.0, "render": 1.0}
+    assert not_made(rows, {}, {}, STANDARD.views) == {"replay": 1.0, "render": 1.0}
     streams = {stream.stream_id for stream in streams_of(rows[0].perturbations).values()}
     # Both views of the twin and of the robot's start, and a moved agent view for each camera, which is all 9 change.
-    left = not_made(rows, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)})
+    left = not_made(rows, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)}, STANDARD.views)
     assert left["replay"] == 0.5
     moved = {one.stream_id for row in rows if row.axis == "camera" for one in streams_of(row.perturbations).values()}
     assert left["render"] == (len(moved - streams) + 2) / (len(moved | streams) + 2)
     alone = [replace(row, trajectory_id=twin) for row in rows if row.axis == "language"]
-    assert not_made(alone, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)}) == {
+    assert not_made(alone, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)}, STANDARD.views) == {
         "replay": 0.0,
         "render": 0.0,
     }

@@ -17,6 +17,7 @@ from sentences import Vectors, vector
 from pipeline.axes import axes_of
 from pipeline.compute.pool import Workers, runner
 from pipeline.config import PlanConfig
+from pipeline.episode_schema import STANDARD
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode, resized
@@ -80,7 +81,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
     frames, trajectories = FrameStore(folder / FRAMES, run.render), TrajectoryStore(folder / TRAJECTORIES)
     with runner(run.compute, folder, renders=True) as workers:
         rejected: dict[str, str] | None = None
-        while (rejected_now := rejections(rows, frames_by_trajectory(frames.rows()))) != rejected:
+        while (rejected_now := rejections(rows, frames_by_trajectory(frames.rows()), STANDARD.views)) != rejected:
             rejected = rejected_now
             Replays(run.demos, run.replay, trajectories, workers, run.filter).complete(rows, rejected)
             outcome = selection.select(chosen, verdicts_of(trajectories.rows(), chosen, run.filter), rejected)

@@ -40,7 +40,8 @@ def fetched(path: Path, sha256: str, command: Sequence[str], content: str, remed
         try:
             subprocess.run(command, cwd=scratch, check=True, capture_output=True, text=True)
         except (OSError, subprocess.CalledProcessError) as error:
-            reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1]
+            printed = (getattr(error, "stderr", None) or "").strip().splitlines()
+            reason = printed[-1] if printed else str(error)
             raise PipelineError(f"{content} could not be downloaded ({reason})", where=path, remedy=remedy) from error
         downloaded = Path(scratch) / path.name
         check(downloaded, sha256, content)

@@ -80,9 +80,9 @@ def _values(file: Path, key: str) -> list[str]:
         raise _unreadable(file, error) from error
     values: list[str] = []
     for line in lines:
-        first, _, value = line.strip().partition(" ")
-        if first.lower() == key:
-            values.append(value.strip())
+        words = line.split(maxsplit=1)
+        if len(words) == 2 and words[0].lower() == key:
+            values.append(words[1].rstrip())
     return values
 
 

@@ -103,18 +103,26 @@ def setup() -> dict[str, str]:
     """
     # A Dask worker imports NumPy before this project, so its environment decides NumPy's machine code.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
-    try:
-        required = [Requirement(line).name for line in requires(DISTRIBUTION) or []]
-        of_formats = [kind.packages for kind in FORMATS]
-        for name in (DISTRIBUTION, *required, *chain.from_iterable([*PACKAGES.values(), *of_formats])):
+    required = [Requirement(line).name for line in _requirements()]
+    of_formats = [kind.packages for kind in FORMATS]
+    for name in (DISTRIBUTION, *required, *chain.from_iterable([*PACKAGES.values(), *of_formats])):
+        try:
             versions[name] = version(name)
-    except PackageNotFoundError as error:
-        versions[str(error.name)] = "not installed"
+        except PackageNotFoundError:
+            versions[name] = "not installed"
     package = Path(__file__).resolve().parent.parent
     files = [file for file in package.rglob("*") if file.suffix in SOURCES]
     files += schema_file("episode.json").parent.glob("*.json")
     content = sorted((file.name, checksum(file)) for file in files)
     return versions | {f"code of {PACKAGE}": digest("code", content)[:16]}
+
+
+def _requirements() -> list[str]:
+    """Return the requirements of this project; none if the project is not installed."""
+    try:
+        return requires(DISTRIBUTION) or []
+    except PackageNotFoundError:
+        return []
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from pathlib import Path
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source, StarterSource
+from pipeline.libero.hdf5 import demo_file
 from pipeline.libero.tasks import SUITES
 from pipeline.types import Demo, Task
 
@@ -81,7 +82,7 @@ def _entries(task: Task, root: Path) -> list[DemoEntry]:
     Raises:
         PipelineError: if there is no such file, or no usable demonstration in it.
     """
-    file = root / task.suite / f"{task.name}_demo.hdf5"
+    file = demo_file(root, task)
     try:
         return _entries_of(edition(file), task, root)
     except OSError as error:
@@ -101,10 +102,11 @@ def _entries_of(version: Edition, task: Task, root: Path) -> list[DemoEntry]:
         PipelineError: if there is none; it is the first demonstration's error.
     """
     index = HDF5Source(root).index([task])
-    of_task = [problem for problem in index.problems if problem.name.startswith(str(task))]
     if not index.entries:
-        if of_task:
-            raise of_task[0].error
+        for problem in index.problems:
+            # The folder may have files of no task, such as <task>_demo_old.hdf5.
+            if problem.name == str(task) or problem.name.startswith(f"{task}/"):
+                raise problem.error
         raise PipelineError(
             "the file has no demonstration", where=version.path, expected="at least one group data/demo_<number>"
         )

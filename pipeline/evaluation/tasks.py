@@ -51,13 +51,14 @@ class EvaluationTask:
 
     Attributes:
         source: ``libero`` for a task without perturbation, also a user's own. ``libero_plus`` for a test task. ``own``
-            for held-out perturbations on one or more of this project's axes. ``goals`` for a LIBERO task that asks for
-            another object of its scene.
-        suite, base: suite and name of the LIBERO task or of the user's own task.
+            for held-out perturbations on one or more of this project's axes. ``goals`` for another goal in the scene
+            of a LIBERO task: another object for its place, or the goal of another LIBERO task.
+        suite, base: suite and name of the LIBERO task, whose scene the episode has, or of the user's own task.
         name: name of the test task in LIBERO-Plus, else a name that is composed of the other fields. It is unique among
             the tasks of its source and suite.
         axis, component: perturbed axis and component, several joined by +; ``clean`` without a perturbation. In
-            ``goals`` the component is the category of the object that is asked for.
+            ``goals`` the component is the category of the object that is asked for, or ``other_scene`` for the goal of
+            another task.
         level: strength of all perturbations, 1 to 5; 0 if it is unknown.
         number: number of the perturbation (``own``), and of the initial state, the reset or the demonstration; 0 in
             ``libero_plus``.
@@ -165,9 +166,11 @@ class Replacement:
 
         Objects, regions and initial states do not change.
         """
-        text = task.bddl_file.read_text()
-        start = text.index("(:goal")
-        return text[:start] + re.sub(rf"\b{self.old}\b", self.new, text[start:])
+        facts = []
+        for predicate, *arguments in bddl.read(task.bddl_file).goal:
+            facts.append((predicate, *(self.new if name == self.old else name for name in arguments)))
+        text = task.bddl_file.read_text(encoding="utf-8")
+        return bddl.replace_sections(text, {":goal": bddl.goal_text(facts)})
 
 
 def carried_tasks(scene: Task, number: int) -> list[EvaluationTask]:

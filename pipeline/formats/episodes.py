@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from pipeline.errors import PipelineError
 from pipeline.grouping import grouped
-from pipeline.libero.carried import IN_SCENE
+from pipeline.libero.tasks import IN_SCENE
 from pipeline.seeding import digest
 from pipeline.types import Episode
 

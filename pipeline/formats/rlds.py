@@ -53,7 +53,7 @@ class Rlds(Format[RldsConfig]):
     recipe: ClassVar = 8
     packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
     splits_each_suite: ClassVar = True  # OpenVLA-OFT, when it validates, reads the split val of each set.
-    held_out_place: ClassVar = "are the split `val` of each set."
+    held_out_place: ClassVar = "are the split `val` of each set that has this split."
     group: ClassVar = "rlds"
     step_s = 0.0004
     columns: ClassVar = (

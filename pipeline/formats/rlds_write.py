@@ -16,7 +16,7 @@ import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
 from pipeline.episode_check import check
-from pipeline.episode_schema import MATRICES, SCHEMA, STANDARD, Content, MapSpec, MatrixSpec, VectorSpec, labels_of
+from pipeline.episode_schema import MATRICES, SCHEMA, Content, MapSpec, MatrixSpec, VectorSpec, labels_of
 from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
@@ -24,7 +24,7 @@ from pipeline.formats.tfrecord import OVERHEAD_BYTES, framed
 from pipeline.types import Episode
 
 
-def write_shard(path: Path, episode_ids: Sequence[str], load: Load, content: Content = STANDARD) -> None:
+def write_shard(path: Path, episode_ids: Sequence[str], load: Load, content: Content) -> None:
     """Write a TFRecord file of episodes with this content.
 
     Raises:
@@ -40,7 +40,7 @@ def write_shard(path: Path, episode_ids: Sequence[str], load: Load, content: Con
             file.write(framed(example.SerializeToString(deterministic=True)))
 
 
-def write_metadata(folder: Path, lengths: Mapping[Path, int], content: Content = STANDARD) -> None:
+def write_metadata(folder: Path, lengths: Mapping[Path, int], content: Content) -> None:
     """Write the files that TFDS reads in addition to the shards.
 
     Args:
@@ -71,7 +71,7 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], content: Content =
     )
 
 
-def texts(content: Content = STANDARD) -> dict[str, str]:
+def texts(content: Content) -> dict[str, str]:
     """Return the texts of ``dataset_info.json`` for people."""
     kept, end = ("miss the goal", "failure") if "outcome" in content.extras else ("solve the task", "success")
     return {
@@ -85,7 +85,7 @@ def texts(content: Content = STANDARD) -> dict[str, str]:
 
 
 @cache
-def features(content: Content = STANDARD) -> Any:
+def features(content: Content) -> Any:
     """Return the feature tree (``tfds.features.FeaturesDict``)."""
     frame = partial(
         tfds.features.Image,
@@ -148,7 +148,7 @@ def _map(spec: MapSpec, content: Content) -> Any:
 
 
 @cache
-def _serializer(content: Content = STANDARD) -> Any:
+def _serializer(content: Content) -> Any:
     return tfds.core.ExampleSerializer(features(content).get_serialized_info())
 
 

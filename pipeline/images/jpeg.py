@@ -22,7 +22,7 @@ def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
 
 
 def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
-    """Resize a frame, so that each pixel is the mean of the area that it covers.
+    """Resize a frame: smaller by the mean of the area that a pixel covers, larger by the nearest pixel.
 
     If the frame has the requested size already, return the frame itself.
     """

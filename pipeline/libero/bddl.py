@@ -18,9 +18,9 @@ Fact = tuple[str, ...]
 """A predicate and its arguments, such as ``("on", "plate_1", "main_table_plate_region")``."""
 
 _ARENA = re.compile(rf"libero_({'|'.join(get_args(Arena))})(?:_tabletop)?_manipulation")
-_PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
+_PROBLEM = re.compile(r"\(\s*define\s*\(\s*problem\s+([^\s()]+)\s*\)")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII)
-_LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
+_LANGUAGE = re.compile(r"\(\s*:language\s([^()]*)\)")
 
 
 ARGUMENTS = {"on": 2, "in": 2, "open": 1, "close": 1, "turnon": 1, "turnoff": 1}
@@ -332,6 +332,43 @@ def parse(text: str, where: object) -> Bddl:
         raise PipelineError(f"the file is not a BDDL file ({error})", where=where, expected=expected) from error
 
 
+def without_comments(text: str) -> str:
+    """Return a BDDL file's text without comments, which LIBERO ignores."""
+    return re.sub(r";.*", "", text)
+
+
+def replace_sections(text: str, sections: Mapping[str, str]) -> str:
+    """Return a BDDL file's text without comments and with other sections.
+
+    Args:
+        text: the text.
+        sections: name of a section, such as ``:goal``, to its new content; a section that the text lacks is added.
+    """
+    text = without_comments(text)
+    for name, content in sections.items():
+        begin = re.search(rf"\(\s*{name}(?=[\s()])", text, re.IGNORECASE)
+        start = text.rindex(")") if begin is None else begin.start()
+        end = start if begin is None else _end(text, start)
+        text = f"{text[:start]}({name} {content}){text[end:]}"
+    return text
+
+
+def _end(text: str, start: int) -> int:
+    """Return the index after the expression that begins at ``start``."""
+    depth = 0
+    for place in range(start, len(text)):
+        depth += {"(": 1, ")": -1}.get(text[place], 0)
+        if depth == 0:
+            return place + 1
+    raise ValueError("the expression has no end")
+
+
+def goal_text(facts: Iterable[Fact]) -> str:
+    """Return the content of the section ``:goal`` that requires all of the facts."""
+    joined = " ".join(f"({' '.join(fact)})" for fact in facts)
+    return f"(And {joined})"
+
+
 def heading(text: str, where: object) -> tuple[str, str]:
     """Return ``problem`` and ``language`` of a BDDL file's text without parsing it.
 
@@ -340,7 +377,7 @@ def heading(text: str, where: object) -> tuple[str, str]:
     Raises:
         PipelineError: when the text has no problem or no instruction.
     """
-    text = text.lower()
+    text = without_comments(text).lower()
     problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
     if problem is None or language is None:
         raise PipelineError("the file is not a BDDL file", where=where, expected="a BDDL problem with :language")

@@ -12,11 +12,8 @@ from pathlib import Path
 
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl, Fact
-from pipeline.libero.tasks import find_task
+from pipeline.libero.tasks import IN_SCENE, find_task
 from pipeline.types import Task
-
-IN_SCENE = "__in__"
-"""Text between the names of a carried task and of its scene in names of files."""
 
 
 class CannotCarryError(ValueError):
@@ -54,27 +51,20 @@ def definition_of(task: Task) -> Bddl:
 
 
 def bddl_text(task: Task) -> str:
-    """Return the BDDL text of a task, which LIBERO's environment can load; of a carried task, with its goal."""
+    """Return the BDDL text of a task, which LIBERO's environment can load.
+
+    For a carried task, this is the scene's text without comments, with the instruction and the goal of the task.
+    """
     text = task.bddl_file.read_text(encoding="utf-8")
     if task.goal_file is None:
         return text
     joined = definition_of(task)
-    facts = " ".join(f"({' '.join(fact)})" for fact in joined.goal)
-    sections = {":language": joined.language, ":obj_of_interest": " ".join(joined.of_interest)}
-    for name, content in (sections | {":goal": f"(And {facts})"}).items():
-        start = text.lower().index(f"({name}")
-        text = f"{text[:start]}({name} {content}){text[_end(text, start) :]}"
-    return text
-
-
-def _end(text: str, start: int) -> int:
-    """Return the index after the expression that begins at ``start``."""
-    depth = 0
-    for place in range(start, len(text)):
-        depth += {"(": 1, ")": -1}.get(text[place], 0)
-        if depth == 0:
-            return place + 1
-    raise ValueError("the expression has no end")
+    sections = {
+        ":language": joined.language,
+        ":obj_of_interest": " ".join(joined.of_interest),
+        ":goal": bddl.goal_text(joined.goal),
+    }
+    return bddl.replace_sections(text, sections)
 
 
 def counterparts(scene: Bddl, task: Bddl) -> dict[str, str]:

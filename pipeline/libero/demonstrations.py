@@ -268,7 +268,7 @@ class HDF5Source:
         return lengths
 
     def _path(self, task: Task) -> Path:
-        return self.root / task.suite / f"{task.name}_demo.hdf5"
+        return hdf5.demo_file(self.root, task)
 
     def _files_of_no_task(self, suite: str) -> Iterator[Problem]:
         """Yield a problem for each file that is not named after a task of the suite.
@@ -287,7 +287,7 @@ class HDF5Source:
         for path in sorted(folder.glob("*.hdf5")):
             try:
                 # A dataset in this layout also has files of tasks in the scenes of others, which are no demonstrations.
-                task_named(suite, path.name.removesuffix("_demo.hdf5"))
+                task_named(suite, path.name.removesuffix(hdf5.SUFFIX))
             except PipelineError as error:
                 yield Problem(f"{suite}/{path.name}", PipelineError(error.what, where=path, expected=error.expected))
 
@@ -317,7 +317,7 @@ class HDF5Source:
                 raise PipelineError(
                     f"the file is named after one task but was recorded for another, {recorded!r} (bddl_file_name)",
                     where=path,
-                    remedy=f"move the file to {self.root / suite / recorded}_demo.hdf5; if it is a recording of "
+                    remedy=f"move the file to {self.root / suite / recorded}{hdf5.SUFFIX}; if it is a recording of "
                     f"{task.name}, correct bddl_file_name in a copy",
                 )
             reject_other_control(data, f"{path} data")

@@ -10,6 +10,7 @@ from huggingface_hub.hf_api import RepoSibling
 
 from pipeline.errors import PipelineError
 from pipeline.files import checksum
+from pipeline.libero.hdf5 import SUFFIX
 from pipeline.libero.tasks import tasks
 
 REPOSITORY = "yifengzhu-hf/LIBERO-datasets"
@@ -39,7 +40,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
     """
     wanted: list[str] = []
     for suite in suites:
-        wanted += [f"{task}_demo.hdf5" for task in tasks(suite)]
+        wanted += [f"{task}{SUFFIX}" for task in tasks(suite)]
     remedy = (
         "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run the command again, which resumes the download; "
         "or use the starter set, demos.source: starter, which needs no hub"

@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.assets import package_folder
-from pipeline.libero.carried import bddl_text, file_name
+from pipeline.libero.carried import bddl_text, definition_of, file_name
 from pipeline.types import Floats, Task
+
+SUFFIX = "_demo.hdf5"
+"""Text after the name of a task in the name of the file of its demonstrations."""
 
 GET_AGAIN = (
     "compare the file with its source, and copy or download it again into another folder; the starter set needs no file"
@@ -217,11 +220,14 @@ def proprioception(hands: Floats, joints: Floats) -> dict[str, Floats]:
     }
 
 
+def demo_file(root: Path, task: Task) -> Path:
+    """Return the file of a task's demonstrations in a folder with LIBERO's layout."""
+    return root / task.suite / f"{task.name}{SUFFIX}"
+
+
 def task_attributes(task: Task, frame_px: int = FRAME_PX) -> dict[str, str]:
     """Return the attributes of the group ``data`` that depend only on the task and the size of the frames."""
-    bddl = bddl_text(task)
-    (problem,) = re.findall(r"\(problem\s+([^()]+)\)", bddl)
-    (language,) = re.findall(r"\(:language\s+([^()]+)\)", bddl)
+    definition = definition_of(task)
     bddl_file = f"libero/libero/bddl_files/{task.suite}/{file_name(task)}.bddl"
     controller = package_folder("robosuite") / "controllers" / "config" / "osc_pose.json"
     env_kwargs = {
@@ -242,22 +248,23 @@ def task_attributes(task: Task, frame_px: int = FRAME_PX) -> dict[str, str]:
     }
     env_args = {
         "type": 1,
-        "env_name": problem.replace("LIBERO_", "Libero_"),
-        "problem_name": problem.lower(),
+        # LIBERO's name of the class, such as Libero_Tabletop_Manipulation.
+        "env_name": definition.problem.title(),
+        "problem_name": definition.problem,
         "bddl_file": bddl_file,
         "env_kwargs": env_kwargs,
     }
     problem_info = {
-        "problem_name": problem.lower(),
+        "problem_name": definition.problem,
         "domain_name": "robosuite",
-        "language_instruction": language.strip().lower(),
+        "language_instruction": definition.language,
     }
     return {
         "env_name": str(env_args["env_name"]),
         "env_args": json.dumps(env_args),
         "problem_info": json.dumps(problem_info),
         "bddl_file_name": bddl_file,
-        "bddl_file_content": bddl,
+        "bddl_file_content": bddl_text(task),
         "macros_image_convention": "opengl",
         "tag": "libero-v1",
     }

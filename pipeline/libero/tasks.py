@@ -32,6 +32,9 @@ _TESTED = re.compile(
 )
 """Names of LIBERO-Plus's test tasks: the name of a LIBERO task, and codes of the changes."""
 
+IN_SCENE = "__in__"
+"""Text between the names of a task and of the scene that it is carried to, in names of files (``carried.py``)."""
+
 OWN = Path("tasks")
 """Folder of the user's own tasks: ``<suite>/<task>.bddl`` below it.
 
@@ -87,7 +90,8 @@ def _reject_unusable(task: Task) -> None:
     """Check the name and the instruction of an own task.
 
     Raises:
-        PipelineError: when the name belongs to a test task, or the instruction is empty or has ``debris``.
+        PipelineError: when the name belongs to a test task or has ``IN_SCENE``, or the instruction is empty or has
+            ``debris``.
     """
     base = base_of_test(task.name)
     if base:
@@ -96,6 +100,12 @@ def _reject_unusable(task: Task) -> None:
             where=task.bddl_file,
             expected="a task that the benchmark does not test",
             remedy="leave test tasks out of the suite: a policy that is trained on them cannot be tested",
+        )
+    if IN_SCENE in task.name:
+        raise PipelineError(
+            f"the name has {IN_SCENE!r}, which separates the names of a task and of another scene in names of files",
+            where=task.bddl_file,
+            remedy="rename the file, and the file of its demonstrations",
         )
     if not task.instruction.strip():
         raise PipelineError(

@@ -40,8 +40,7 @@ def absolute_actions(actions: Floats, first_grip: GripPose, grips: Sequence[Grip
         first_grip: pose in ``first_posture``.
         grips: K poses, before each action.
     """
-    units = np.repeat([SCHEMA.action.unit_m, SCHEMA.action.unit_rad], 3)
-    deltas = units * np.clip(actions[:, :6], *SCHEMA.action.range)
+    deltas = SCHEMA.action.units * np.clip(actions[:, :6], *SCHEMA.action.range)
     positions_m, rotations = [], []
     rotation = Rotation.from_matrix(first_grip.rotation)
     for grip, delta in zip(grips, deltas, strict=True):

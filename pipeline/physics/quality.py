@@ -46,7 +46,7 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
     hand = np.stack(positions)
     qpos = np.stack([State.of(state, model.nq).qpos for state in trajectory.states])
     steps_m: Floats = np.linalg.norm(np.diff(hand, axis=0), axis=1)
-    commanded = hand[:-1] + SCHEMA.action.unit_m * np.clip(trajectory.actions[:, :3], -1, 1)
+    commanded = hand[:-1] + SCHEMA.action.unit_m * np.clip(trajectory.actions[:, :3], *SCHEMA.action.range)
     away_m = _displacements(model, qpos, target_names)
     low, high = np.stack([model.joint(name).range for name in ARM]).T
     arm = qpos[:, [int(model.joint(name).qposadr[0]) for name in ARM]]

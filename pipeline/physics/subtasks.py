@@ -187,7 +187,8 @@ class _Seen:
             touched = self._touch(self._below(self.model.jnt_bodyid[joint]), self.robot)
             moving = np.append(np.abs(np.diff(turned)) >= MOVING, False)
             for reached, left in _runs(touched | moving):
-                change = turned[left - 1] - turned[reached]
+                # The last motion ends in the state ``left``.
+                change = turned[min(left, len(turned) - 1)] - turned[reached]
                 if abs(change) >= TURNED:
                     verb = away if change > 0 else back
                     yield _Deed(reached, left, thing, (Subtask(reached, f"{verb} {thing}"),))

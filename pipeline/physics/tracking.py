@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RejectedError
 from pipeline.physics.reference import Reference, runs
 from pipeline.types import Floats
 
-OUTPUT_MAX = np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5])
+OUTPUT_MAX = SCHEMA.action.units
 """(6,) m and rad that an action of 1 commands (robosuite's ``osc_pose.json``)."""
 
 STRIDE = 0.306 * OUTPUT_MAX
@@ -194,7 +195,6 @@ def _grasp_offset(reference: Reference, step: int, hand: Hand, pose: Callable[[s
 
 def _followed(reference: Reference, name: str) -> Floats:
     """Return the share (K+1,) of a moved thing's displacement that the hand has to follow at each state."""
-    weights: Floats = np.zeros(len(reference) + 1)
     if _moves(reference, name):
         held_steps = np.flatnonzero(reference.held[name])
         carried_runs = runs(reference.carried[name], FLICKER)
@@ -202,7 +202,8 @@ def _followed(reference: Reference, name: str) -> Floats:
         first = int(held_steps[0])
         # The object is carried off, or pushed all the way. The share falls to 0 until the object is put down.
         taken, put_down = long_runs[0] if long_runs else (first, int(held_steps[-1]))
-        return np.maximum(weights, _window(reference, first, max(taken, first), put_down - MARGIN))
+        return _window(reference, first, max(taken, first), put_down - MARGIN)
+    weights: Floats = np.zeros(len(reference) + 1)
     for first, last in runs(reference.met[name], FLICKER):
         since = _pushed_since(reference, first) if name in reference.places else first
         later = np.flatnonzero(reference.engaged[last + FLICKER + 1 :])

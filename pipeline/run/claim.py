@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -143,6 +143,22 @@ def reject_unmarked(folder: Path) -> None:
         )
 
 
+def _params() -> Any:
+    """Return the content of ``params.yaml``; `None` if there is no such file.
+
+    Raises:
+        PipelineError: when the file is not YAML.
+    """
+    if not PARAMS.is_file():
+        return None
+    try:
+        return yaml.safe_load(PARAMS.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise PipelineError(
+            f"the file is not valid YAML ({error})", where=PARAMS, expected="run: <name> and data: <folder>"
+        ) from error
+
+
 def reject_other_folder(file: Path) -> None:
     """Reject a configuration whose run is not where DVC looks for the files of stages, by params.yaml.
 
@@ -150,7 +166,7 @@ def reject_other_folder(file: Path) -> None:
         PipelineError: naming both folders, or both names.
     """
     config = load(file)
-    chosen = yaml.safe_load(PARAMS.read_text()) if PARAMS.is_file() else None
+    chosen = _params()
     if not isinstance(chosen, dict) or chosen.get("run") != file.stem:
         return
     if config.name != file.stem:

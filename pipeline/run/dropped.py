@@ -15,7 +15,7 @@ from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
 from pipeline.planning.streams import streams_of
 from pipeline.run import machine
-from pipeline.run.outcome import FAILURE_REASONS, has_frames, rejections
+from pipeline.run.outcome import has_frames, rejections, to_render
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
@@ -134,17 +134,11 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
     verdict_of = {row.trajectory_id: verdicts.get(row.trajectory_id, undecided) for row in rows}
     not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not has_frames(row, frames, views)}
     judged = select(rows, verdict_of, not_rendered | rejected)
-    trajectories: set[str] = set()
+    trajectories = {row.trajectory_id for row in rows if judged[row.episode_id].reason != NOT_NEEDED}
     streams: set[tuple[str, str]] = set()
-    failures = FAILURE_REASONS if config.export.failures else ()
-    for row in rows:
-        verdict = judged[row.episode_id]
-        if verdict.reason == NOT_NEEDED:
-            continue
-        trajectories.add(row.trajectory_id)
-        if verdict.kept or verdict.reason in (NOT_REPLAYED, rejected.get(row.episode_id), *failures):
-            row_streams = streams_of(row.perturbations, views).values()
-            streams |= {(row.trajectory_id, stream.stream_id) for stream in row_streams}
+    undecided_rows = [row for row in rows if judged[row.episode_id].reason == NOT_REPLAYED]
+    for row in (*to_render(rows, judged, rejected, config.export), *undecided_rows):
+        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations, views).values()}
     return trajectories, streams
 
 

@@ -88,7 +88,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
         PipelineError: when a demonstration cannot be read, finished replays would be generated again or expanded
             demonstrations be deleted without permission, or a file of other demonstrations would be replaced.
     """
-    file_of = {entry.task: out / entry.task.suite / f"{entry.task.name}_demo.hdf5" for entry in demos.index().entries}
+    file_of = {entry.task: hdf5.demo_file(out, entry.task) for entry in demos.index().entries}
     for file in file_of.values():
         _reject_other_demonstrations(file)
     store = TrajectoryStore(out / ".replays")

@@ -8,7 +8,6 @@ import platform
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError
 from itertools import chain
 from pathlib import Path, PurePath
 from typing import Any
@@ -129,7 +128,7 @@ def stage_memory(
             made_with_all.update(made_with(step))
         for kind in FORMATS:
             made_with_all.update(kind.made_with())
-    except (PipelineError, PackageNotFoundError):
+    except PipelineError:
         # The stage `doctor` reports the fault.
         return Memory(run.folder, name, None, outputs, "a package is missing, or another copy of it is imported")
     made_with_all["code"] = library()[:16]

@@ -124,7 +124,7 @@ def build(
         verdict = run.verdicts[row.episode_id]
         # The trajectory of a reserve that was not needed may be stored for another episode.
         replayed = run.trajectories.get(row.trajectory_id, {}) if verdict.reason != NOT_NEEDED else {}
-        frames = run.frames[row.trajectory_id] if replayed and has_frames(row, run.frames) else None
+        frames = run.frames[row.trajectory_id] if replayed and has_frames(row, run.frames, run.views) else None
         result = Result(
             kept=verdict.kept,
             reason=verdict.reason,

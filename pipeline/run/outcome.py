@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, FilterConfig
-from pipeline.episode_schema import STANDARD
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import ExportConfig
 from pipeline.planning import plan, selection
@@ -41,6 +40,7 @@ class Outcome:
         rows: rows of the plan.
         trajectories: trajectory id to its row in the table of replays.
         frames: trajectory id to the record of its stored frames.
+        views: names of the views of every episode.
         verdicts: episode id to verdict.
         failures: ids of the failures to write, in the order of the plan; empty unless ``export.failures`` is set.
     """
@@ -48,6 +48,7 @@ class Outcome:
     rows: Sequence[plan.Row]
     trajectories: Mapping[str, Mapping[str, Any]]
     frames: Mapping[str, StoredFrames]
+    views: tuple[str, ...]
     verdicts: Mapping[str, Verdict]
     failures: Sequence[str] = ()
 
@@ -74,15 +75,13 @@ def shuffled(episode_ids: Iterable[str]) -> list[str]:
 
 
 def read_replays(
-    rows: Sequence[plan.Row],
-    store: TrajectoryStore,
-    rejected: Mapping[str, str] | None = None,
-    limits: FilterConfig = FilterConfig(),  # noqa: B008 - frozen
+    rows: Sequence[plan.Row], store: TrajectoryStore, rejected: Mapping[str, str], limits: FilterConfig
 ) -> dict[str, dict[str, Any]]:
     """Map trajectory ids to their rows in the table of replays.
 
     Args:
         rejected: episode id to the reason why its frames were rejected.
+        limits: ``filter`` of the configuration.
 
     Raises:
         PipelineError: when a trajectory that the plan needs is missing, or can no longer be read.
@@ -94,9 +93,7 @@ def read_replays(
     return trajectories
 
 
-def rejections(
-    rows: Sequence[plan.Row], frames: Mapping[str, StoredFrames], views: tuple[str, ...] = STANDARD.views
-) -> dict[str, str]:
+def rejections(rows: Sequence[plan.Row], frames: Mapping[str, StoredFrames], views: tuple[str, ...]) -> dict[str, str]:
     """Map the ids of episodes with a rejected stream to the reason of the rejection.
 
     Args:
@@ -135,7 +132,28 @@ def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: Frame
     not_rendered = [row for row in (*kept, *failures) if not has_frames(row, stored_frames, views)]
     folders = dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)
     _reject_missing(list(folders), "render")
-    return Outcome(rows, replays, stored_frames, judged, [row.episode_id for row in failures])
+    return Outcome(rows, replays, stored_frames, views, judged, [row.episode_id for row in failures])
+
+
+def to_render(
+    rows: Sequence[plan.Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str], export: ExportConfig
+) -> list[plan.Row]:
+    """List the episodes whose frames the stage ``render`` stores, so far.
+
+    These are kept episodes, failures if ``export.failures`` requests them, and episodes with rejected frames, which
+    would else be tried again. ``export.where`` selects among rendered episodes.
+
+    Args:
+        judged: verdicts of ``selection.select``.
+        rejected: episode id to the reason why its frames were rejected.
+    """
+    failures = FAILURE_REASONS if export.failures else ()
+    listed = []
+    for row in rows:
+        verdict = judged[row.episode_id]
+        if verdict.kept or verdict.reason in (rejected.get(row.episode_id), *failures):
+            listed.append(row)
+    return listed
 
 
 def list_failures(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
@@ -149,7 +167,7 @@ def list_failures(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], expor
     return [row for row in failures if where.takes(row.axis, row.component, row.level, row.suite)]
 
 
-def has_frames(row: plan.Row, frames: Mapping[str, StoredFrames], views: tuple[str, ...] = STANDARD.views) -> bool:
+def has_frames(row: plan.Row, frames: Mapping[str, StoredFrames], views: tuple[str, ...]) -> bool:
     """Return whether the frames of an episode's views are stored."""
     needed = {stream.stream_id for stream in streams_of(row.perturbations, views).values()}
     return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams

@@ -13,7 +13,7 @@ from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row
 from pipeline.planning.selection import select
 from pipeline.planning.streams import Stream, streams_of
-from pipeline.run.outcome import FAILURE_REASONS, rejections
+from pipeline.run.outcome import rejections, to_render
 from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, file_name, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -68,11 +68,11 @@ def render_plan(
     """
     device = gl.choose().device
     judged = verdicts_of(trajectories.rows(), rows, config.filter)
-    views, failures = config.render.content.views, FAILURE_REASONS if config.export.failures else ()
+    views = config.render.content.views
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in frames.refresh().items() if row["device"] == device}
-        needed = _needed(rows, judged, rejections(rows, frames_by_trajectory(stored), views), views, failures)
+        needed = _needed(rows, judged, rejections(rows, frames_by_trajectory(stored), views), config)
         missing = {name: portion for name, portion in needed.items() if name not in stored}
         if not missing:
             return set(needed)
@@ -105,32 +105,31 @@ def _needed(
     rows: Sequence[Row],
     judged: Mapping[str, Verdict],
     rejected: Mapping[str, str],
-    views: tuple[str, ...],
-    failures: Collection[str],
+    config: Config,
 ) -> dict[str, Portion]:
     """Map the name of each file that the plan needs to its portion, by the verdicts and rejections so far.
 
     Args:
         judged: trajectory id to its verdict.
         rejected: episode id to the reason why its frames were rejected.
-        views: names of the views of every episode.
-        failures: reasons of dropped episodes that are rendered too.
+        config: configuration of the run.
     """
     # Episodes of a trajectory share its replay and its files, so any of their rows names its demonstration and task.
     row_of = {row.trajectory_id: row for row in rows}
     planned: dict[str, dict[str, Stream]] = {trajectory_id: {} for trajectory_id in row_of}
-    needed: dict[str, set[str]] = {}
-    outcome = select(rows, judged, rejected)
     for row in rows:
-        streams = {stream.stream_id: stream for stream in streams_of(row.perturbations, views).values()}
-        planned[row.trajectory_id] |= streams
-        verdict = outcome[row.episode_id]
-        # A rejected stream stays needed: without it, its episode would be tried again.
-        if verdict.kept or verdict.reason in (rejected.get(row.episode_id), *failures):
-            needed.setdefault(row.trajectory_id, set()).update(streams)
+        planned[row.trajectory_id] |= _streams(row, config)
+    needed: dict[str, set[str]] = {}
+    for row in to_render(rows, select(rows, judged, rejected), rejected, config.export):
+        needed.setdefault(row.trajectory_id, set()).update(_streams(row, config))
     files: dict[str, Portion] = {}
     for trajectory_id, stream_ids in needed.items():
         for portion in portions(planned[trajectory_id], stream_ids):
             name = file_name(trajectory_id, [stream.stream_id for stream in portion])
             files[name] = (row_of[trajectory_id], portion)
     return files
+
+
+def _streams(row: Row, config: Config) -> dict[str, Stream]:
+    """Map the ids of an episode's streams to the streams."""
+    return {stream.stream_id: stream for stream in streams_of(row.perturbations, config.render.content.views).values()}

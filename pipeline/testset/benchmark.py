@@ -72,7 +72,7 @@ class TestSet:
         return tuple(tests[place] for place in self.places(task, axis, same))
 
     def places(self, task: Task, axis: str, same: Same) -> list[int]:
-        """Return the indices of the test tasks of ``on`` in the test tasks of ``of``."""
+        """Return the indices of the test tasks of ``on`` in the test tasks of ``on_axis``."""
         return _places(self, axis, same).get(shared(task, same), [])
 
     def find(self, suite: str, name: str) -> TestTask:

@@ -4,7 +4,6 @@ import re
 import zipfile
 from collections.abc import Hashable, Iterable, Mapping
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.errors import PipelineError
@@ -30,7 +29,7 @@ class _TestDefinitions(NamedTuple):
     instructions: Mapping[str, str]
 
 
-def reject_test_tasks(wanted: Iterable[Task], folder: Path = FOLDER) -> None:
+def reject_test_tasks(wanted: Iterable[Task]) -> None:
     """Compare scene, scene class and instruction of each own task with the test tasks.
 
     An own task in one of LIBERO's scenes is no test task: the tests of camera, robot start, noise and language begin in
@@ -41,7 +40,7 @@ def reject_test_tasks(wanted: Iterable[Task], folder: Path = FOLDER) -> None:
     """
     own_tasks = [task for task in wanted if task.suite not in SUITES]
     for task in own_tasks:
-        equal = _equal_test(task, folder)
+        equal = _equal_test(task)
         if equal is not None:
             part, test_task = equal
             raise PipelineError(
@@ -52,9 +51,9 @@ def reject_test_tasks(wanted: Iterable[Task], folder: Path = FOLDER) -> None:
             )
 
 
-def _equal_test(task: Task, folder: Path) -> tuple[str, str] | None:
+def _equal_test(task: Task) -> tuple[str, str] | None:
     """Return the part that a task shares with a test task, and the test task's name; `None` if it shares no part."""
-    test, definition = _definitions(folder), bddl.read(task.bddl_file)
+    test, definition = _definitions(), bddl.read(task.bddl_file)
     if definition.problem in test.classes:
         return "scene class", test.classes[definition.problem]
     if definition.scene in test.scenes:
@@ -66,17 +65,17 @@ def _equal_test(task: Task, folder: Path) -> tuple[str, str] | None:
 
 
 @cache
-def _definitions(folder: Path) -> _TestDefinitions:
-    """Collect the definitions that only test tasks have, from the wheel in ``folder``."""
+def _definitions() -> _TestDefinitions:
+    """Collect the definitions that only test tasks have, from the benchmark's wheel."""
     libero_definitions: list[Bddl] = []
     for suite in SUITES:
         libero_definitions += [bddl.read(task.bddl_file) for task in tasks(suite)]
     scenes: dict[Hashable, str] = {}
     classes: dict[str, str] = {}
     instructions: dict[str, str] = {}
-    with zipfile.ZipFile(fetch_testset(folder)) as archive:
+    with zipfile.ZipFile(fetch_testset(FOLDER)) as archive:
         reader = Reader(archive)
-        for test_task in load(folder).tasks:
+        for test_task in load(FOLDER).tasks:
             name = f"{test_task.suite}/{test_task.name}"
             if test_task.axis in ("layout", "pose"):
                 scenes.setdefault(bddl.parse(_text(reader, test_task), name).scene, name)

@@ -142,7 +142,7 @@ def _goals(case: Case) -> Iterator[Fault]:
     The goal of the orientation is compared at steps that turn the hand; at others, it is a former goal.
     """
     made, spec = case.made, SCHEMA.action
-    deltas = np.clip(made.action[:, :6].astype(float), *spec.range) * np.repeat([spec.unit_m, spec.unit_rad], 3)
+    deltas = np.clip(made.action[:, :6].astype(float), *spec.range) * spec.units
     goals = made.action_absolute.astype(float)
     positions_m = made.state[:, :3] + deltas[:, :3]
     turns = np.any(deltas[:, 3:] != 0, axis=1)

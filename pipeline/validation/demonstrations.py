@@ -13,10 +13,11 @@ from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.hdf5.layout import VALIDATION_FOLDER
-from pipeline.libero.carried import IN_SCENE, task_named
+from pipeline.libero.carried import task_named
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
+from pipeline.libero.hdf5 import SUFFIX, demo_file
 from pipeline.libero.starts import kept_actions, recorded_start
-from pipeline.libero.tasks import STEP_LIMITS, exceeds_step_limit, find_task, suites
+from pipeline.libero.tasks import IN_SCENE, STEP_LIMITS, exceeds_step_limit, find_task, suites
 from pipeline.physics.environment import shared
 from pipeline.planning.plan import twins
 from pipeline.run.outcome import FAILURE_REASONS
@@ -95,7 +96,7 @@ def _unread(file: Path, root: Path) -> str | None:
     folder, *below = file.relative_to(root).parts
     if folder == VALIDATION_FOLDER and len(below) == 2:
         return f"no run with this demos.root reads it; check the validation part as a folder, {root / folder}"
-    name = file.name.removesuffix("_demo.hdf5")
+    name = file.name.removesuffix(SUFFIX)
     if IN_SCENE in name and folder in suites() and len(below) == 1:
         with suppress(PipelineError):
             task_named(folder, name)
@@ -105,10 +106,10 @@ def _unread(file: Path, root: Path) -> str | None:
 
 def _task_of(file: Path, root: Path) -> Task:
     suite, *name = file.relative_to(root).parts
-    if suite not in suites() or len(name) != 1 or not name[0].endswith("_demo.hdf5"):
+    if suite not in suites() or len(name) != 1 or not name[0].endswith(SUFFIX):
         raise PipelineError("no run reads this file", where=file, expected=LAYOUT, remedy="move or rename the file")
     try:
-        return find_task(suite, name[0].removesuffix("_demo.hdf5"))
+        return find_task(suite, name[0].removesuffix(SUFFIX))
     except PipelineError as error:
         remedy = error.remedy or "move or rename the file"
         raise PipelineError(error.what, where=error.where or file, expected=error.expected, remedy=remedy) from error
@@ -221,7 +222,7 @@ class _FileJob:
 
     @property
     def _file(self) -> Path:
-        return self.root / self.task.suite / f"{self.task.name}_demo.hdf5"
+        return demo_file(self.root, self.task)
 
     def _place(self, entry: DemoEntry) -> str:
         return f"{self.root / entry.source.split()[0]} data/{entry.key}"

@@ -202,7 +202,7 @@ def _unlike_stores(run: Run) -> Iterator[Fault]:
         needed = row["reason"] != selection.NOT_NEEDED
         replayed = trajectories.get(planned.trajectory_id, {}) if needed else {}
         twin = trajectories.get(trajectory_of[planned.twin_id], {})
-        rendered = bool(replayed) and outcome.has_frames(planned, frames)
+        rendered = bool(replayed) and outcome.has_frames(planned, frames, run.config.render.content.views)
         path_m, twin_path_m = replayed.get("path_m"), twin.get("path_m")
         expected = {
             "steps": replayed.get("steps"),

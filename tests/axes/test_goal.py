@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import starter_demo
+from libero.libero.envs.bddl_utils import robosuite_parse_problem
 
 from pipeline.axes import Axes, from_json, task_of, to_json
 from pipeline.axes.goal import GoalAxis, GoalPerturbation, held_out, level, pairs, usable
@@ -118,6 +119,23 @@ def test_a_carried_task_has_the_scene_of_one_file_and_the_goal_of_the_other() ->
             kinds = [[made.category(made.owner(name) or name) for name in fact[1:]] for fact in made.goal]
             assert kinds == [[task.category(task.owner(name) or name) for name in fact[1:]] for fact in task.goal]
             assert bddl.parse(bddl_text(pair.played), "") == made
+
+
+def test_a_scene_file_of_another_spelling_is_carried_to_as_libero_reads_it(tmp_path: Path) -> None:
+    """With comments that have sections and parentheses, with spaces, in upper case, and without things of interest."""
+    pair = usable("libero_spatial")[0]
+    text = pair.scene.bddl_file.read_text()
+    odd = re.sub(r"\(:obj_of_interest[^()]*\)", "", text)
+    odd = odd.replace("(:goal", "; (:goal of mine, see :)\n( :GOAL ; (").replace(
+        "(:language", "; (:language\n(:Language"
+    )
+    scene_file, plain, carried_to = (tmp_path / f"{name}.bddl" for name in ("scene", "plain", "carried"))
+    scene_file.write_text(odd)
+    plain.write_text(bddl_text(pair.played))
+    carried_to.write_text(bddl_text(replace(pair.played, bddl_file=scene_file)))
+    read = robosuite_parse_problem(str(carried_to))
+    assert read == robosuite_parse_problem(str(plain))
+    assert " ".join(read["language_instruction"]) == definition_of(pair.task).language
 
 
 def test_the_bowl_is_the_one_that_the_instruction_means() -> None:

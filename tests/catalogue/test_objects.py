@@ -286,6 +286,20 @@ def test_a_model_without_its_picture_is_rejected(folder: Path, tmp_path: Path, m
     assert len(models(own(tmp_path / "mine"))) == 1
 
 
+def test_a_name_after_a_tab_is_read_as_trimesh_reads_it(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine" / "toy_house"
+    write_house(mine, scale=0.01)
+    for name in ("house.obj", "house.mtl"):
+        text = (mine / name).read_text()
+        (mine / name).write_text(text.replace("mtllib ", "mtllib\t").replace("map_Kd ", "\tmap_Kd \t"))
+    (before,) = models(own(tmp_path / "mine")).values()
+    assert compiled(before).ntex == 1
+    models.cache_clear()
+    Image.new("RGB", (4, 4), "blue").save(mine / "roof.png")
+    (after,) = models(own(tmp_path / "mine")).values()
+    assert after.sha256 != before.sha256
+
+
 def test_a_picture_outside_of_the_folder_of_a_model_is_rejected(folder: Path, tmp_path: Path) -> None:
     """trimesh does not read it, and would convert the model without a picture."""
     mine = tmp_path / "mine" / "toy_house"

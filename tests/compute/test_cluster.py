@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from PIL import Image
 
 from pipeline import gl
 from pipeline.axes import Axes
+from pipeline.compute import cluster as cluster_module
 from pipeline.compute.cluster import Workplace, setup
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
@@ -215,6 +217,18 @@ def test_the_next_stage_deletes_what_a_killed_run_left_for_its_workers(cluster: 
 
 def test_workers_have_all_that_files_are_made_with() -> None:
     assert {name for name in made_with("encoding") if not name.startswith("recipe of")} <= setup().keys()
+
+
+def test_a_missing_package_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = setup.__wrapped__()
+
+    def without_vla_eval(name: str) -> str:
+        if name == "vla-eval":
+            raise PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(cluster_module, "version", without_vla_eval)
+    assert setup.__wrapped__() == whole | {"vla-eval": "not installed"}
 
 
 def test_replays_that_workers_leave_undone_are_named(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from synthetic import (
 )
 
 from pipeline.clients import oft
-from pipeline.episode_schema import Content
+from pipeline.episode_schema import STANDARD, Content
 from pipeline.formats import rlds_write
 from pipeline.formats.tfrecord import columns
 
@@ -113,7 +113,7 @@ def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
     """Both formats hand out the files and numbers that went in; what is not extra stays as it is without them."""
     rlds = write_rlds(tmp_path, with_extras, extras=EXTRAS)
     lerobot_set = write_lerobot(tmp_path, with_extras, extras=EXTRAS)
-    plain, tree = rlds_write.features(), rlds_write.features(Content(extras=EXTRAS))
+    plain, tree = rlds_write.features(STANDARD), rlds_write.features(Content(extras=EXTRAS))
     rows = {name: {**rlds.record().places[name], "episode_id": name, "demo_id": name} for name in IDS}
     for episode_id, row in rows.items():
         source = with_extras(episode_id)

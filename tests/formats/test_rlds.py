@@ -18,7 +18,7 @@ from every_set import Written, every_set, pixels
 from numpy.typing import NDArray
 from synthetic import EXTRAS, IDS, MATRICES, SET, episode, records, with_extras, write_rlds
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, STANDARD
 from pipeline.formats import rlds_write
 
 
@@ -62,7 +62,7 @@ def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
 def test_rlds_features_are_openvlas(written: Written) -> None:
     builder = tfds.builder_from_directory(written.version)
     features = builder.info.features
-    assert features.to_json() == rlds_write.features().to_json()
+    assert features.to_json() == rlds_write.features(STANDARD).to_json()
     specs = {
         name: (spec.shape, np.dtype(spec.np_dtype))
         for name, spec in features["steps"].feature.items()

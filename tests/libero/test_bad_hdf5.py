@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from conftest import Once
 from recordings import NAME, TASK, as_published, file_in, recording, scene_here, write_eleven
 
 from pipeline.errors import PipelineError
+from pipeline.evaluation.recordings import count_of
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import tasks
@@ -31,6 +33,17 @@ def root(tmp_path: Path, model_file: str) -> Path:
 def replace(group: h5py.Group, name: str, values: object) -> None:
     del group[name]
     group[name] = values
+
+
+def test_the_fault_of_a_tasks_own_file_is_named_and_not_that_of_a_copy_next_to_it(root: Path) -> None:
+    file = file_in(root)
+    shutil.copy(file, file.with_name(f"{TASK.name}_demo_old.hdf5"))
+    with h5py.File(file, "r+") as opened:
+        for demo in opened["data"].values():
+            del demo["actions"]
+    with pytest.raises(PipelineError, match="'actions' is missing") as caught:
+        count_of(TASK, root)
+    assert str(file) in str(caught.value)
 
 
 def with_value(array: Floats, value: float) -> Floats:

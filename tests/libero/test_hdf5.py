@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -106,6 +107,18 @@ def test_written_file_has_liberos_layout_and_is_reproducible(root: Path, tmp_pat
     again = tmp_path / "again.hdf5"
     hdf5.write(again, TASK, (recording(model_file, seed=seed) for seed in range(11)))
     assert again.read_bytes() == file_in(root).read_bytes()
+
+
+def test_attributes_are_of_a_task_as_libero_reads_its_file(tmp_path: Path) -> None:
+    plain = hdf5.task_attributes(TASK)
+    odd = tmp_path / TASK.bddl_file.name
+    text = TASK.bddl_file.read_text()
+    text = text.replace("(problem", "( Problem").replace("(:language", "; (:language (problem other)\n(:Language  ")
+    odd.write_text(text)
+    written = hdf5.task_attributes(replace(TASK, bddl_file=odd))
+    assert written.pop("bddl_file_content") == text
+    assert written == {name: value for name, value in plain.items() if name != "bddl_file_content"}
+    assert json.loads(plain["problem_info"])["language_instruction"] == TASK.instruction
 
 
 def test_an_exact_copy_is_left_out_and_both_are_named(root: Path, model_file: str) -> None:

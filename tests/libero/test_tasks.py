@@ -81,6 +81,16 @@ def test_own_tasks_stand_next_to_liberos(tmp_path: Path, monkeypatch: pytest.Mon
         shutil.rmtree(tmp_path / "tasks" / name)
 
 
+def test_an_own_task_with_the_name_of_a_carried_task_is_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = own_task(tmp_path / "tasks" / "my_suite")
+    file.rename(file.with_name("bowl__in__there.bddl"))
+    with pytest.raises(PipelineError, match=r"bowl__in__there\.bddl: the name has '__in__'"):
+        select_tasks(["my_suite/*"])
+
+
 @pytest.mark.parametrize("language", ["", "  "])
 def test_an_own_task_without_an_instruction_is_rejected_when_it_is_read(
     language: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -159,6 +159,24 @@ def test_a_knob_that_is_released_halfway_is_turned_one_way(
         assert (angles_rad[end] > angles_rad[begin]) == (not backwards)
 
 
+@pytest.mark.parametrize(
+    "shares", [(0.0, 0.9, 0.9), (0.0, 0.07, 0.14, 0.14), (0.0, 0.5)], ids=["once", "twice", "at the end"]
+)
+def test_a_knob_that_turns_without_a_contact_is_turned_in_its_last_moving_step_too(
+    shares: tuple[float, ...], whole: dict[Task, Trajectory]
+) -> None:
+    """A knock between two stored states; the hand stays where it starts."""
+    at_rest = 10
+    angles = at_rest * shares[:1] + shares
+    trajectory = whole[STOVE]
+    states = np.repeat(trajectory.states[:1], len(angles), axis=0)
+    largest_rad = max(compiled(trajectory).joint("flat_stove_1_button").range, key=abs)
+    states[:, knob(trajectory)] = np.array(angles) * largest_rad
+    turned = replace(trajectory, states=states, actions=np.repeat(trajectory.actions[:1], len(angles) - 1, axis=0))
+    expected = [(0, "approach the stove"), (at_rest, "turn on the stove")]
+    assert [tuple(found) for found in subtasks(turned, STOVE)] == expected
+
+
 def knob(trajectory: Trajectory) -> int:
     """Return the place of the knob's angle in a flattened state, whose first entry is the time."""
     return 1 + int(compiled(trajectory).joint("flat_stove_1_button").qposadr[0])

@@ -245,7 +245,11 @@ def test_a_language_column_and_who_can_open_it_are_named(data: Path) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "words"),
-    [("rlds", "the split `val` of each set"), ("lerobot", "`meta/info.json`"), ("lerobot_v21", "end in `_val`")],
+    [
+        ("rlds", "the split `val` of each set that has this split"),
+        ("lerobot", "`meta/info.json`"),
+        ("lerobot_v21", "end in `_val`"),
+    ],
 )
 def test_a_validation_split_is_named(data: Path, kind: str, words: str) -> None:
     assert "For validation" not in written(data, kind)

@@ -68,6 +68,9 @@ def test_dvc_s_run_must_be_where_dvc_looks(clone: Path, field: str, value: str, 
         reject_other_folder(file)
     Path("params.yaml").write_text("run: starter\ndata: data\n")
     reject_other_folder(file)
+    Path("params.yaml").write_text("run: [starter\n")
+    with pytest.raises(PipelineError, match=r"params\.yaml: the file is not valid YAML"):
+        reject_other_folder(file)
 
 
 def test_push_rejects_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

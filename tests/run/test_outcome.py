@@ -11,12 +11,13 @@ from pipeline.axes import Axes
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import PlanConfig, ReplayConfig
+from pipeline.episode_schema import SCHEMA, STANDARD
 from pipeline.export_config import ExportConfig, Where
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
-from pipeline.run.outcome import Outcome, list_failures
+from pipeline.run.outcome import Outcome, list_failures, to_render
 from pipeline.stores.frame_store import StoredFrames
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Subtask, Verdict
@@ -42,6 +43,7 @@ def run() -> Outcome:
             twin.trajectory_id: StoredFrames("", "a GPU", "open_loop", "its actions", shown, subtasks=SUBTASKS),
             robot.trajectory_id: StoredFrames("", "a GPU", "tracked", "others", rejected={"a stream": "too_dark"}),
         },
+        STANDARD.views,
         {row.episode_id: Verdict(row.wanted, "kept" if row.wanted else "reserve_not_needed") for row in rows}
         | {robot.episode_id: Verdict(False, "too_dark")},
     )
@@ -71,6 +73,27 @@ def test_each_row_has_what_its_own_trajectory_and_frames_came_to(run: Outcome) -
         ["robot", "tracked", 120, 1.5, None],
         ["robot", *nothing],
     ]
+
+
+def test_an_episode_without_the_frames_of_a_further_view_is_not_rendered(run: Outcome) -> None:
+    (further,) = (view for view, spec in SCHEMA.further_views.items() if spec.camera == "sideview")
+    shown = table(replace(run, views=(*STANDARD.views, further)))
+    assert [row["steps"] for row in shown] == [row["steps"] for row in table(run)]
+    for row in shown:
+        assert row["actions_sha256"] is row["gl_device"] is row["subtask_texts"] is row["rewrites"] is None
+
+
+def test_kept_and_requested_failures_and_rejected_episodes_are_rendered(run: Outcome) -> None:
+    reasons = ("kept", "goal_not_reached", "reserve_not_needed", "too_dark", "worker_lost")
+    judged = {row.episode_id: Verdict(False, reason) for row, reason in zip(run.rows, reasons, strict=True)}
+    twin, failure, _, rejected, _ = run.rows
+    judged[twin.episode_id] = Verdict(True, "kept")
+
+    def rendered(**export: Any) -> list[plan.Row]:
+        return to_render(run.rows, judged, {rejected.episode_id: "too_dark"}, ExportConfig(**export))
+
+    assert rendered() == [twin, rejected]
+    assert rendered(failures=True, where=Where(axis=("robot",))) == [twin, failure, rejected]
 
 
 def test_only_what_the_export_names_counts_as_chosen(run: Outcome) -> None:

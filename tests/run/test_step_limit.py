@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
+from pipeline.episode_schema import STANDARD
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import exceeds_step_limit, find_task
@@ -49,7 +50,7 @@ def test_the_limits_are_those_of_the_evaluation() -> None:
 def test_the_wine_bottle_is_marked_and_reported(replayed: tuple[Row, TrajectoryStore]) -> None:
     row, store = replayed
     verdicts = verdicts_of(store.rows(), [row], FilterConfig())
-    run = Outcome([row], store.rows(), {}, {row.episode_id: verdicts[row.trajectory_id]})
+    run = Outcome([row], store.rows(), {}, STANDARD.views, {row.episode_id: verdicts[row.trajectory_id]})
     (told,) = manifest.build(run, {}, [], None, lambda _: ()).to_pylist()
     assert (told["kept"], told["steps"], told["exceeds_step_limit"]) == (True, 347, True)
     (sentence,) = counts.beyond_step_limit([told])

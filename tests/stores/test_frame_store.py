@@ -17,6 +17,7 @@ from pipeline import gl, identity
 from pipeline.axes.light import LightPerturbation
 from pipeline.compute.pool import Workers, loop
 from pipeline.config import Config
+from pipeline.episode_schema import STANDARD
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
@@ -155,7 +156,9 @@ def test_rendering_ends_when_all_streams_of_a_trajectory_are_rejected(
     (shown,) = stored.values()
     assert shown.streams == set()
     assert len(shown.rejected) == 4, "two views of the light episode and of its reserve"
-    assert outcome.rejections(lights, stored) == dict.fromkeys((row.episode_id for row in lights), "too_dark")
+    assert outcome.rejections(lights, stored, STANDARD.views) == dict.fromkeys(
+        (row.episode_id for row in lights), "too_dark"
+    )
     rendered = len(passes)
     render_into(tmp_path, lights, config, replayed, counted)
     assert len(passes) == rendered, "a second run has nothing to do"
@@ -286,14 +289,16 @@ def test_a_rendering_that_is_given_up_is_dropped_with_its_reason_and_keeps_what_
 ) -> None:
     render_into(tmp_path / "at_once", rows, config, replayed, given_up)
     stored = frames_by_trajectory(FrameStore(tmp_path / "at_once", config.render).rows())
-    assert set(outcome.rejections(rows, stored).values()) == {"worker_lost"}
+    assert set(outcome.rejections(rows, stored, STANDARD.views).values()) == {"worker_lost"}
     render_into(tmp_path / "at_once", rows, config, replayed, nothing_to_do)
 
     twin, lights = rows[:1], without_twins(rows)
     render_into(tmp_path / "later", twin, config, replayed, loop)
     render_into(tmp_path / "later", rows, config, replayed, given_up)
     stored = frames_by_trajectory(FrameStore(tmp_path / "later", config.render).rows())
-    assert outcome.rejections(rows, stored) == dict.fromkeys((row.episode_id for row in lights), "worker_lost")
+    assert outcome.rejections(rows, stored, STANDARD.views) == dict.fromkeys(
+        (row.episode_id for row in lights), "worker_lost"
+    )
     assert len(stored[twin[0].trajectory_id].streams) == 2, "the twin's own frames stay"
 
 
@@ -327,5 +332,7 @@ def test_a_rejection_of_a_reserve_that_is_no_longer_needed_is_forgotten(
         FrameStore(tmp_path, config.render),
         given_up,
     )
-    assert outcome.rejections(rows, frames_by_trajectory(store.rows())) == {rows[2].episode_id: "worker_lost"}
+    assert outcome.rejections(rows, frames_by_trajectory(store.rows()), STANDARD.views) == {
+        rows[2].episode_id: "worker_lost"
+    }
     assert render_into(tmp_path, rows, config, replayed, loop) == expected

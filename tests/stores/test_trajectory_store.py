@@ -148,7 +148,7 @@ def test_a_damaged_trajectory_is_an_error_with_its_reason_and_is_never_silently_
     for read in (
         lambda: TrajectoryStore(trajectories).row(file.stem),
         lambda: TrajectoryStore(trajectories).load(file.stem),
-        lambda: outcome.read_replays(rows, TrajectoryStore(trajectories)),
+        lambda: outcome.read_replays(rows, TrajectoryStore(trajectories), {}, FilterConfig()),
         lambda: Replays(config.demos, config.replay, TrajectoryStore(trajectories), nothing_to_do).complete(rows),
     ):
         with pytest.raises(
@@ -169,10 +169,10 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     before = file.read_bytes()
     fault(file)
     with pytest.raises(PipelineError, match=rf"(?s){file.name}.*stages/replay.py CONFIG"):
-        outcome.read_replays(rows, TrajectoryStore(trajectories))
+        outcome.read_replays(rows, TrajectoryStore(trajectories), {}, FilterConfig())
     Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop).complete(rows)
     assert file.read_bytes() == before
-    assert outcome.read_replays(rows, TrajectoryStore(trajectories))
+    assert outcome.read_replays(rows, TrajectoryStore(trajectories), {}, FilterConfig())
 
 
 @pytest.mark.parametrize("error", [MemoryError("mine"), KeyError("mine"), ValueError("mine"), OSError("mine")])
@@ -327,4 +327,4 @@ def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_agai
     assert Replays(config.demos, config.replay, TrajectoryStore(tmp_path), nothing_to_do).complete(rows) == judged
     assert {verdict.reason for verdict in selection.select(rows, judged).values()} == {"worker_lost"}
     assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
-    assert outcome.read_replays(rows, TrajectoryStore(tmp_path))
+    assert outcome.read_replays(rows, TrajectoryStore(tmp_path), {}, FilterConfig())

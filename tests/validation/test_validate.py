@@ -18,7 +18,7 @@ from conftest import BOWL, MILK, STOVE, rot, run_stages, starter_demo, tiny_conf
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.compute.pool import loop
 from pipeline.config import RenderConfig, ReplayConfig, load
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, STANDARD
 from pipeline.files import checksum
 from pipeline.formats import rlds_write
 from pipeline.formats.lerobot.video import Video
@@ -156,14 +156,19 @@ def spoil_rlds(data: Path, rows: Rows, names: Mapping[str, tuple[str, Task] | st
     rewrites = {row["episode_id"]: json.loads(row["rewrites"]) for row in rows if row["kept"]}
     load = EpisodeLoader(data, RenderConfig(), rewrites=rewrites)
     for shard in (data / "rlds").rglob("*.tfrecord-*"):
-        ids = [columns(record, rlds_write.features())[f"{METADATA}episode_id"][0].decode() for record in records(shard)]
+        ids = [
+            columns(record, rlds_write.features(STANDARD))[f"{METADATA}episode_id"][0].decode()
+            for record in records(shard)
+        ]
         with shard.open("wb") as file:
             for episode_id in ids:
                 name = names[episode_id]
                 tree = rlds_write._nested_example(load(episode_id))
                 if isinstance(name, tuple) and name in IN_RLDS:
                     IN_RLDS[name](tree)
-                example = rlds_write._serializer().get_tf_example(rlds_write.features().encode_example(tree))
+                example = rlds_write._serializer(STANDARD).get_tf_example(
+                    rlds_write.features(STANDARD).encode_example(tree)
+                )
                 file.write(framed(example.SerializeToString()))
 
 

@@ -7,12 +7,11 @@ from numpy.typing import NDArray
 
 from pipeline.episode_schema import ALL_VIEWS
 from pipeline.libero.carried import task_named
+from pipeline.libero.hdf5 import SUFFIX
 from pipeline.types import Floats, Task
 
 VALIDATION_FOLDER = "val"
 """Folder of the files of the validation episodes; the files of all other episodes are next to it."""
-
-SUFFIX = "_demo.hdf5"
 
 PROVENANCE = "attributes of data/demo_<number>"
 

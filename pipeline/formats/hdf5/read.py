@@ -52,7 +52,7 @@ def files_of(root: Path) -> list[Path]:
     Raises:
         PipelineError: when it has none.
     """
-    files = sorted([*root.glob(f"*/*{layout.SUFFIX}"), *root.glob(f"{layout.VALIDATION_FOLDER}/*/*{layout.SUFFIX}")])
+    files = sorted([*root.glob(f"*/*{hdf5.SUFFIX}"), *root.glob(f"{layout.VALIDATION_FOLDER}/*/*{hdf5.SUFFIX}")])
     if not files:
         raise PipelineError("no HDF5 file", where=root, expected="<suite>/<task>_demo.hdf5", remedy=MAKE_AGAIN)
     return files
