@@ -20,6 +20,7 @@ from pipeline.episode_schema import SCHEMA, SIZE_PX, Content
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, ExportConfig
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
+from pipeline.libero.starts import SETTLING_STEPS
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish_config import PublishConfig
 from pipeline.strict_yaml import StrictLoader
@@ -173,7 +174,7 @@ class ReplayConfig(Frozen):
 
     mode: Literal["open_loop", "tracked", "auto"] = "auto"
     noops: Literal["drop", "trim_ends", "keep"] = "drop"
-    settle_steps: int = Field(default=10, ge=0, le=200)
+    settle_steps: int = Field(default=SETTLING_STEPS, ge=0, le=200)
     fixture_seed: int = Field(default=0, ge=0, lt=2**32)
 
 

@@ -26,10 +26,10 @@ from pipeline.evaluation.picture_fit import (
     variants,
 )
 from pipeline.evaluation.picture_points import place
-from pipeline.evaluation.simulator import SETTLING_STEPS
 from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
 from pipeline.files import replaced
 from pipeline.images.jpeg import encode_exactly, resized
+from pipeline.libero.starts import SETTLING_STEPS
 from pipeline.rendering.geometry import COMMON, FLOOR, GRIPPER, NOTHING, ROBOT, ROOM, TABLE, WALL
 from pipeline.rendering.srgb import FIRST_VERSION
 from pipeline.types import Frame, Task

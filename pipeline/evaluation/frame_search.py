@@ -13,10 +13,10 @@ import numpy as np
 from pipeline.errors import RejectedError
 from pipeline.evaluation.picture_fit import Fit, Smooth, Variant, fit, smoothed, variants
 from pipeline.evaluation.picture_points import place
-from pipeline.evaluation.simulator import SETTLING_STEPS
 from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, StartFrames
 from pipeline.libero import bddl
 from pipeline.libero import tasks as libero_tasks
+from pipeline.libero.starts import SETTLING_STEPS
 from pipeline.types import Frame, Task
 
 UNSETTLED = range(SETTLING_STEPS - 2)

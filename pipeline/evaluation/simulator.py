@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import Perturbation
+from pipeline.libero.starts import SETTLING_STEPS
 from pipeline.machine_code import fixed_machine_code
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
@@ -20,9 +21,6 @@ from pipeline.rendering.renderer import LastScene
 from pipeline.scenes.compiled import ARM, FINGERS, proprioception
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
-
-SETTLING_STEPS = 10
-"""Number of control steps before the first observation, in which objects settle (OpenVLA's and LIBERO-Plus's rule)."""
 
 OBSERVED = 24
 """Number of the substep, among the 25 of a control step, that robosuite 1.4.0 observes.

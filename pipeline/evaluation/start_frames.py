@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.policies import VIEWS
-from pipeline.evaluation.simulator import SETTLING_STEPS, Simulator
+from pipeline.evaluation.simulator import Simulator
 from pipeline.evaluation.tasks import libero_states
 from pipeline.images.jpeg import to_policy
+from pipeline.libero.starts import SETTLING_STEPS
 from pipeline.libero.tasks import SUITES
 from pipeline.physics.environment import DUMMY_ACTION
 from pipeline.rendering.geometry import Instances

@@ -18,6 +18,9 @@ suites' evaluations.
 LEFT_OUT_STEPS = 5
 """Control steps after a reset that LIBERO removes from a recording (``cap_index`` of its ``create_dataset.py``)."""
 
+SETTLING_STEPS = 10
+"""Number of control steps before the first observation, in which objects settle (OpenVLA's and LIBERO-Plus's rule)."""
+
 NOOP_NORM = 1e-4
 """Largest norm of the six pose deltas that still counts as no motion (OpenVLA's `regenerate_libero_dataset.py`)."""
 
