@@ -1,9 +1,10 @@
-"""Difference of the videos from stored and from rendered frames, on one demonstration of each given task.
+"""Difference of the videos from stored and from rendered frames: of demonstrations, or of a finished run.
 
     nice -n 10 python benchmarks/video_quality.py [--tasks SUITE/TASK ...]
+    nice -n 10 python benchmarks/video_quality.py --run configs/starter.yaml
 
-The script measures both views without noise, and the agent view with each noise at its strongest. The last line is the
-result as JSON.
+The script measures both views without noise, and the agent view with each noise at its strongest. With ``--run``, it
+compares all videos of a finished run with the stored frames, by axis. The last line is the result as JSON.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from pipeline.axes import Axes
 from pipeline.axes.noise import NoiseAxis
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
-from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
+from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.lerobot.video import Video
 from pipeline.images.jpeg import decode, encode, to_policy
@@ -36,6 +38,7 @@ from pipeline.machine_code import ensure_fixed_machine_code
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.replay_job import ReplayJob
+from pipeline.run.run import Run
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Frame
@@ -53,7 +56,11 @@ STRONGEST = 5
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=TASKS)
+    parser.add_argument("--run", type=Path, metavar="CONFIG", help="configuration of a finished run with LeRobot v3.0")
     arguments = parser.parse_args()
+    if arguments.run:
+        print(json.dumps(_of_run(Run(load(arguments.run)))))
+        return
     measured: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     demos = DemosConfig(tasks=tuple(arguments.tasks), per_task=1)
     with runner(ComputeConfig(), Path("data")) as run:
@@ -68,6 +75,35 @@ def main() -> None:
         table.add_row(name, str(row["frames"]), *decibels, str(row["video_bytes"]), str(row["stored_bytes"]))
     Console(width=150).print(table)
     print(json.dumps(result))
+
+
+def _of_run(run: Run) -> dict[str, Any]:
+    """Return the decibels of a run's videos to its stored frames: mean, worst and the share below 37, by axis."""
+    rows = [row for row in run.manifest if row["kept"]]
+    rows.sort(key=lambda row: row["lerobot_episode_index"])
+    root, episodes = run.dataset("lerobot").root, run.episodes()
+    played = {view: _played(root / "videos" / SCHEMA.views[view].lerobot_key) for view in SCHEMA.views}
+    measured: dict[str, list[float]] = defaultdict(list)
+    for row in rows:
+        episode = episodes(row["episode_id"])
+        for view, video_frames in played.items():
+            for stored, video_frame in zip(episode.frames[view], video_frames, strict=False):
+                measured[row["axis"]].append(cv2.PSNR(decode(stored), video_frame))
+    measured["all"] = list(chain.from_iterable(measured.values()))
+    result = {}
+    for axis, decibels in measured.items():
+        below = round(float(np.mean(np.array(decibels) < 37.0)), 4)
+        mean, worst = round(float(np.mean(decibels)), 2), round(min(decibels), 2)
+        result[axis] = {"frames": len(decibels), "mean": mean, "worst": worst, "below 37 dB": below}
+    return result
+
+
+def _played(folder: Path) -> Iterator[Frame]:
+    """Yield the frames of all videos of a view, in the order of the episodes."""
+    for path in sorted(folder.rglob("*.mp4")):
+        with av.open(str(path)) as video:
+            for frame in video.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
 
 
 def _measured(entry: DemoEntry, demos: DemosConfig) -> dict[str, NDArray[np.float64]]:

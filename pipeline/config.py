@@ -185,8 +185,9 @@ class FilterConfig(Frozen):
     stored.
 
     Attributes:
-        non_target_moved_m: Largest displacement of another object at any step, in m, from the first observation.
-        non_target_left_m: Largest displacement of another object after the last step, in m.
+        non_target_moved_m: Largest displacement of another object at any step, in m, from the first observation; less
+            than 1 mm counts as 0.
+        non_target_left_m: Largest displacement of another object after the last step, in m; less than 1 mm counts as 0.
         touched_steps: Largest number of steps after which the robot touches a thing that is not part of the goal.
         path_m: Largest length of the end effector's path, in m.
         jerk_rms_m_s3: Largest root mean square of the end effector's jerk, in m/s^3.

@@ -210,9 +210,12 @@ class Quality:
     """
 
     non_target_moved_m: Annotated[
-        float, "largest displacement of another object at any step, from the first observation"
+        float,
+        "largest displacement of another object at any step, from the first observation; less than 1 mm counts as 0",
     ]
-    non_target_left_m: Annotated[float, "largest displacement of another object after the last step"]
+    non_target_left_m: Annotated[
+        float, "largest displacement of another object after the last step; less than 1 mm counts as 0"
+    ]
     touched_steps: Annotated[int, "number of steps after which the robot touches a thing that is not part of the goal"]
     path_m: Annotated[float, "length of the end effector's path"]
     jerk_rms_m_s3: Annotated[float, "root mean square of the end effector's jerk, by third differences at 20 Hz"]

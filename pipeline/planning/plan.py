@@ -60,7 +60,9 @@ class Row:
     axis: Annotated[str, "perturbed axis, several joined by +, or clean"]
     component: Annotated[str, "component of the axis, several joined by +, or clean"]
     level: Annotated[str, "strength, 1 to 5, several joined by + in the order of component; 0 for a clean twin"]
-    perturbations: Annotated[str, "JSON list with every parameter, deepest layer first"]
+    perturbations: Annotated[
+        str, "JSON list with every parameter, deepest layer first; gaussian_blur has its former name gaussian"
+    ]
     instruction: Annotated[str, "the text that the policy is prompted with"]
     rank: Annotated[int, "place among the candidates of its axis and task"]
     wanted: Annotated[bool, "false for a reserve, which is used only if another candidate fails"]

@@ -56,7 +56,7 @@ class Result:
     resolved: Annotated[
         str | None,
         "JSON of the results of physics perturbations in the scene, by axis, or under fault the reason of a failed "
-        "simulation; null when not replayed",
+        "simulation; positions of pose are those before the objects settle; null when not replayed",
     ]
     path_ratio: Annotated[
         float | None, "path_m divided by path_m of the clean twin; null if one of them did not reach the goal"
@@ -75,7 +75,7 @@ class Result:
     rewrites: Annotated[
         str | None,
         "other wordings of the task that training may use in place of the instruction: all that the run's language "
-        "axis may sample for the episode; in the manifest a JSON list, null when not rendered",
+        "axis may sample for the episode, also its own rewrite; in the manifest a JSON list, null when not rendered",
     ]
 
 

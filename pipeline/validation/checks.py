@@ -526,3 +526,14 @@ _PICTURES = (jpeg, geometry, depth, boxes, video, cameras, alive)
 _EVERY = (*_LABELS, *_PICTURES, gripper, flags, clock, statistics)
 CHECKS: Mapping[str, Check] = {check.__name__: check for check in _EVERY}
 """Name to check."""
+
+
+def applies(check: str, case: Case) -> bool:
+    """Return whether a check has anything to compare: some need content that only some runs request."""
+    if check == "video":
+        return any(shown_view.video for shown_view in case.shown_views)
+    if check == "depth":
+        return any(copy.depth_m for copy in case.whole)
+    if check == "boxes":
+        return any(made.boxes is not None and "segmentation" in made.maps for made in case.made.geometry.values())
+    return True

@@ -181,6 +181,16 @@ def test_a_failed_check_is_not_hidden(data: Path) -> None:
     assert "passed all checks" not in text
 
 
+def test_a_check_that_compared_nothing_is_left_out(data: Path) -> None:
+    cards = {}
+    for checked in (0, 7):
+        report = VALIDATION | {"depth": {"checked": checked, "findings": []}}
+        (data / "validation.json").write_text(json.dumps(report))
+        cards[checked] = written(data, "rlds").splitlines()
+    assert {*cards[7]} - {*cards[0]} == {"| depth | 7 | passed |"}
+    assert {*cards[0]} <= {*cards[7]}
+
+
 LEROBOT_COLUMNS = [f"camera.{view}.{name}" for view in ("agent", "wrist") for name in ("depth", "segmentation")]
 NAMES = {
     "rlds": ["image_depth", "wrist_image_depth", "image_segmentation", "wrist_image_segmentation"],

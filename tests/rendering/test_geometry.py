@@ -41,7 +41,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
 from pipeline.validation.case import Case
-from pipeline.validation.checks import CHECKS
+from pipeline.validation.checks import CHECKS, applies
 
 EXTRAS: tuple[RenderedExtra, ...] = ("boxes", "depth", "object_poses", "segmentation")
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
@@ -281,6 +281,7 @@ def test_both_datasets_have_what_the_store_has(run: Path) -> None:
         assert [copy.dataset for copy in case.copies] == ["rlds", "lerobot"]
         assert list(CHECKS["geometry"](case)) == []
         assert list(CHECKS["boxes"](case)) == []
+        assert applies("boxes", case)
         last = pixels(case.made.geometry["image"].maps["segmentation"][-1])
         shown = {case.made.instances[place] for place in np.unique(last).tolist()}
         assert {"robot", "gripper", "table", "wall", "plate_1", "wooden_cabinet_1"} <= shown

@@ -222,6 +222,7 @@ def test_a_good_run_passes(finished: Path) -> None:
     assert {check: found["findings"] for check, found in report.items()} == {check: [] for check in report}
     kept = sum(row["kept"] for row in manifest.read(finished / "manifest.parquet"))
     assert {report[check]["checked"] for check in ("motion", "video", "gripper", "place", "provenance")} == {kept}
+    assert report["depth"]["checked"] == report["boxes"]["checked"] == 0, "the run has neither"
     # The clean episode of each of three tasks, and one of each of three axes.
     assert report["rendered"]["checked"] == 6
     assert not (finished / ".work").exists()

@@ -68,8 +68,9 @@ COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 
 ENCODER: Final = "libx264"
 ENCODER_OPTIONS = {
-    # Measured on LIBERO frames (benchmarks/video_quality.py): 40 dB to the stored JPEG files in both views at 6.7 kB a
-    # frame, a third of theirs, no frame below 37 dB. "superfast" saves a tenth of the bytes for twice the time.
+    # Measured on unperturbed frames (benchmarks/video_quality.py): 40 dB to the stored JPEG files in both views at
+    # 6.7 kB a frame, a third of theirs, no frame below 37 dB. Fine colourful surfaces can have 29 dB, because colours
+    # have half the resolution. "superfast" saves a tenth of the bytes for twice the time.
     "preset": "ultrafast",
     # The quantiser is fixed: 22, and 19 for key frames. A "crf" of 20 chooses it for each frame. Its files have equal
     # size and mean quality, but single frames of 35 dB, and take a third more time.
