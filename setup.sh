@@ -158,7 +158,12 @@ quick | test)
     together=(-n 2 --dist loadfile --no-loadscope-reorder)
     # Each process uses one core, as the workers of a run do.
     export LP_NUM_THREADS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
-    if [[ $VERB == quick ]]; then pytest "${together[@]}" -m "not slow"; else pytest "${together[@]}"; fi
-    wait "$types"
+    chosen=()
+    [[ $VERB == test ]] || chosen=(-m "not slow")
+    failed=0
+    pytest "${together[@]}" "${chosen[@]}" || failed=1
+    # Wait for the types after a failed test, too: their faults count, and no process is left behind.
+    wait "$types" || failed=1
+    exit "$failed"
     ;;
 esac

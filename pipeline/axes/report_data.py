@@ -84,6 +84,15 @@ class Bars:
 Plot = Scatter | Histogram | Strips | Bars
 
 
+def groups_of(plot: Plot) -> list[str]:
+    """List the names of the groups that a plot shows, each once."""
+    if isinstance(plot, Bars):
+        return [plot.group]
+    if isinstance(plot, Strips):
+        return list(dict.fromkeys(name for groups in plot.rows.values() for name in groups))
+    return list(plot.groups)
+
+
 class CoveragePlots(NamedTuple):
     """A note on the test set, and plots of an axis."""
 

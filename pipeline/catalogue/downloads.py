@@ -44,7 +44,14 @@ def fetched(path: Path, sha256: str, command: Sequence[str], content: str, remed
             reason = printed[-1] if printed else str(error)
             raise PipelineError(f"{content} could not be downloaded ({reason})", where=path, remedy=remedy) from error
         downloaded = Path(scratch) / path.name
-        check(downloaded, sha256, content)
+        downloaded_sha256 = checksum(downloaded)
+        if downloaded_sha256 != sha256:
+            raise PipelineError(
+                f"{content} was downloaded with another SHA-256, {downloaded_sha256}",
+                where=path,
+                expected=sha256,
+                remedy=remedy,
+            )
         os.replace(downloaded, path)
     return path
 

@@ -92,7 +92,7 @@ def _unreadable(file: Path, error: Exception) -> PipelineError:
         f"the model's file cannot be read ({error})",
         where=file,
         expected="the name of a readable file after mtllib or map_Kd, without options",
-        remedy="put the file there, replace a damaged file, or delete the line that names it",
+        remedy="put the file there, replace a damaged file, or correct the name in the line",
     )
 
 

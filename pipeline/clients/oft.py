@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from pipeline.episode_schema import SCHEMA, SIZE_PX
 from pipeline.errors import PipelineError
@@ -227,7 +227,7 @@ def _is_frame(data: bytes, size_px: int) -> bool:
     try:
         with Image.open(io.BytesIO(data)) as image:  # reads the header only
             return (image.format, image.mode, image.size) == ("JPEG", "RGB", (size_px, size_px))
-    except UnidentifiedImageError:
+    except OSError:  # no image, or one that is cut short
         return False
 
 

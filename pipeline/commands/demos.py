@@ -131,7 +131,8 @@ def check(folder: Path, number: int, config: Path | None) -> int:
     settings = load(config).replay if config else ReplayConfig()
     with runner(ComputeConfig(), folder) as workers:
         report = demonstrations.check(folder, number, workers, settings)
-    for line in (*report.notes, *report.faults):
+    missed = [f"{demo}: the replay misses the goal, while another one of the file reaches it" for demo in report.missed]
+    for line in (*report.notes, *missed, *report.faults):
         print(line)
     print(json.dumps(asdict(report)))
     return int(bool(report.faults))

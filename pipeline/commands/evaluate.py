@@ -99,8 +99,8 @@ def evaluate(
     The command writes a file for each episode into DIR, summary.json with success rates and their 95 % intervals, and
     episodes.csv with the success of each episode. The policy is a model server of vla-eval, which you start first, or a
     checkpoint of lerobot. A stopped evaluation resumes when the command is called again. For test tasks of LIBERO-Plus,
-    the command prints the paper's table of all results in DIR, and writes it into DIR as paper_table.md, .csv and .tex.
-    The last line of the output is JSON.
+    the command prints the paper's table of this policy's results in DIR under these settings. It also writes the table
+    into DIR as paper_table.md, .csv and .tex. The last line of the output is JSON.
     """
     policies = {"server": server, "checkpoint": checkpoint, "replay": replay}
     chosen = [name for name, value in policies.items() if value is not None]

@@ -126,6 +126,17 @@ class Progress:
         return self.reason != "running"
 
 
+def not_begun(progress: Progress, task: EvaluationTask) -> PipelineError:
+    """Return the error about an episode that is over before its first observation."""
+    if progress.reason == REJECTED:
+        return PipelineError("the scene rejects the perturbation", where=str(task), remedy="leave this task out")
+    return PipelineError(
+        f"the scene does not settle ({progress.reason})",
+        where=str(task),
+        remedy="leave this task out; `evaluate` counts such an episode as a failure",
+    )
+
+
 class EpisodeEnvironment:
     """Environment that runs episodes one after the other.
 

@@ -349,7 +349,9 @@ def _without_result(faults: Sequence[tuple[EvaluationTask, str]]) -> PipelineErr
     """Return an error that counts the episodes without a result and names the first of them."""
     named = [f"{what} ({task})" for task, what in faults[:FAULTS_NAMED]]
     more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
+    lost = all(what == LOST for _, what in faults)
+    remedy = "use fewer workers if memory is short" if lost else "correct the policy"
     return PipelineError(
-        f"{len(faults)} episodes have no result: {'; '.join([*named, *more])}",
-        remedy="correct the policy and run the same command again: finished episodes are kept",
+        f"{len(faults)} episode{'s' * (len(faults) > 1)} without a result: {'; '.join([*named, *more])}",
+        remedy=f"{remedy} and run the same command again: finished episodes are kept",
     )

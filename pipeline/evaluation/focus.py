@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from math import isclose
+from math import isclose, isnan
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal, NamedTuple
@@ -107,6 +107,11 @@ class Limits:
 
     floor: float = 0.5
     cap: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("floor", self.floor), ("cap", self.cap)):
+            if isnan(value):
+                raise PipelineError("the limit is not a number", where=f"--{name}", expected="a number such as 0.5")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from pipeline import gl
 from pipeline.errors import PipelineError
-from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, not_begun
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.rollout import Evaluation
 from pipeline.evaluation.tasks import EvaluationTask
@@ -124,7 +124,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         If the episodes do not fill the last round, some environments repeat an episode. A repetition has no row.
 
         Raises:
-            PipelineError: if no environment has an episode left, or if the scene rejects the perturbation.
+            PipelineError: if no environment has an episode left, or if the scene does not settle.
         """
         super().reset(seed=seed)
         count = len(self._tasks)
@@ -140,10 +140,9 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         task = self._tasks[self._next % len(self._tasks)]
         self._next += self._stride
         gl.prepare()
-        if self._environment.reset(task).over:
-            raise PipelineError(
-                "the scene rejects the perturbation", where=str(task), remedy="name other tasks by --env.tasks"
-            )
+        progress = self._environment.reset(task)
+        if progress.over:
+            raise not_begun(progress, task)
         return self._look(), {"is_success": False}
 
     def step(self, action: np.ndarray[Any, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

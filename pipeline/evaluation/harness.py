@@ -24,7 +24,7 @@ from vla_eval.specs import (
 from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import checked_actions, reject_other_actions
-from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, not_begun
 from pipeline.evaluation.evaluate import check_settings, not_trained
 from pipeline.evaluation.policies import NextLook, Wanted, is_shortest
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
@@ -118,12 +118,13 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         """Start an episode and return its first observation.
 
         Raises:
-            PipelineError: if the scene rejects the perturbation.
+            PipelineError: if the scene rejects the perturbation or does not settle.
         """
-        progress = self._environment.reset(EvaluationTask.of_harness(task))
+        wanted = EvaluationTask.of_harness(task)
+        progress = self._environment.reset(wanted)
         if progress.over:
             self._save()
-            raise PipelineError("the scene rejects the perturbation", where=task["name"], remedy="leave this task out")
+            raise not_begun(progress, wanted)
         self._next_look.left = 0
         return self._look()
 

@@ -13,7 +13,7 @@ from pipeline.axes import AXES
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.environment import EpisodeSettings
-from pipeline.evaluation.results import read
+from pipeline.evaluation.results import ACROSS, read
 from pipeline.evaluation.tested import Outcome, TestedPolicy, joined, limits_of, tested_policy
 from pipeline.files import read_json
 from pipeline.grouping import grouped
@@ -39,9 +39,6 @@ CATEGORIES = {
 """Category in the benchmark's ``task_classification.json`` to the paper's dimension."""
 
 Content = TypeVar("Content", bound=BaseModel)
-
-PROTOCOL = ("prompt", "step_limit", "black")
-"""Settings of ``evaluate`` in which the policies of a table may differ."""
 
 LIBERO_TASKS = 10
 """Number of tasks of each of LIBERO's own suites that the benchmark perturbs."""
@@ -148,7 +145,7 @@ def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
     """
     folders, policies = separate(paths)
     if folders:
-        evaluated = [policy for policy in map(tested_policy, read(folders, PROTOCOL)) if policy is not None]
+        evaluated = [policy for policy in map(tested_policy, read(folders, ACROSS)) if policy is not None]
         if not evaluated:
             raise PipelineError(
                 "the results have no test task of LIBERO-Plus",

@@ -10,7 +10,6 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from pipeline.compute.slurm import LOGS
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
 from pipeline.files import is_temporary, read_json, reject_other_file, write
@@ -23,6 +22,9 @@ REJECTED = "refused"
 ALIKE = {"actions": "delta", "black": "none", "initial_states": "libero", "fixture_seed": 0}
 """Settings, and their values if a result leaves them out. Results on one suite of one source can be compared only if
 these settings, the prompt and the step limit are equal."""
+
+ACROSS = ("prompt", "step_limit", "black")
+"""Settings in which compared results may differ if a user asks for it."""
 
 PER_TASK = ("draws", "files of the benchmark", "definition of the task", "demonstration")
 """Versions of a result that differ between tasks."""
@@ -136,9 +138,9 @@ class EpisodeFiles:
         reject_other_file(self.table, ",".join(TABLE))
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
-        # Workers of a cluster write log files into the folder. An evaluation without results writes its summary.
+        # An evaluation without results writes its summary, and may be killed after the video of its first episode.
         names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
-        if set(names) - {"summary.json", self.table.name, LOGS.parts[0]}:
+        if set(names) - {"summary.json", self.table.name, "videos"}:
             raise PipelineError(
                 f"the folder has files but no results of an evaluation: {', '.join(sorted(names)[:3])}",
                 where=self.folder,
@@ -236,15 +238,16 @@ def reject_different(results: Iterable[Stored], across: Collection[str] | None =
         PipelineError: if two results differ; it names their files and the differences.
     """
 
-    def alike(row: EpisodeResult) -> dict[str, object]:
+    def compared(row: EpisodeResult) -> dict[str, object]:
         """Return the facts that must be equal."""
         settings = {name: row.settings.get(name, default) for name, default in ALIKE.items()}
         facts = {"prompt": row.prompt, "step_limit": row.step_limit, **settings}
         return {name: value for name, value in facts.items() if name not in (across or ())}
 
-    choice = "; or compare across the difference by --across prompt, --across step_limit or --across black"
+    options = " or ".join(f"--across {setting}" for setting in ACROSS)
+    choice = f"; or compare across the difference by {options}"
     _agree(
-        ((f"{row.source}/{row.suite}", alike(row), files.path(row.episode)) for row, files in results),
+        ((f"{row.source}/{row.suite}", compared(row), files.path(row.episode)) for row, files in results),
         "these results cannot be compared on ",
         expected="equal prompts, step limits, actions, black views and starts of all compared results",
         remedy=f"evaluate both with equal settings, or leave one of the folders out{'' if across is None else choice}",
@@ -400,11 +403,12 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     return evaluated
 
 
-def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evaluated:
+def _evaluated(group: Sequence[Stored], row_of_each_setting: Sequence[EpisodeResult]) -> Evaluated:
     """Collect the results of one policy under one set of settings.
 
     Args:
-        alike: an episode of the policy under each of its sets of settings; the first one gives the policy's name.
+        row_of_each_setting: an episode of the policy under each of its sets of settings; the first one gives the
+            policy's name.
 
     Raises:
         PipelineError: if a task has two episodes.
@@ -412,9 +416,9 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
     acted = [(row, files) for row, files in group if row.reason != REJECTED]
     reject_repeated_tasks(acted)
     settings = group[0][0].settings
-    name_parts = [alike[0].policy]
+    name_parts = [row_of_each_setting[0].policy]
     for key, value in settings.items():
-        if any(row.settings.get(key) != value for row in alike):
+        if any(row.settings.get(key) != value for row in row_of_each_setting):
             text = value[:8] if key == "plan" else value  # The plan is given by a long digest.
             name_parts.append(f"{key.replace('_', ' ')} {text}")
     videos = {row.episode: files.video(row.episode) for row, files in group}

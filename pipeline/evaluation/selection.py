@@ -14,7 +14,7 @@ from itertools import chain, combinations, count, islice, product
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.axes import AXES, axes_of, level_of_test
 from pipeline.axes.base import LEVELS
@@ -56,7 +56,7 @@ class Selection(Frozen, use_attribute_docstrings=True):
     goal (``goals``); for every two axes the task, a
     held-out perturbation on either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
-    """list of tasks that ``analyze construct`` wrote, in place of a source"""
+    """list of tasks that ``analyze construct`` or ``analyze grade`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES
     """only these suites, such as libero_goal; suites of the user's own tasks must be named"""
     axes: tuple[str, ...] = ()
@@ -74,6 +74,11 @@ class Selection(Frozen, use_attribute_docstrings=True):
     """largest number of tasks, spread evenly over suites, axes, components and levels"""
     seed: int = 0
     """seed of the subset and of all perturbations"""
+
+    @field_validator("suites", "axes", "components", "levels", "tasks")
+    @classmethod
+    def _each_once(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(dict.fromkeys(values))
 
 
 def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:

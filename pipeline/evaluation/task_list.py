@@ -45,7 +45,9 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
         perturbations_digest = listed.digest_perturbations()
     except (OSError, ValueError, LookupError) as error:
         raise PipelineError(
-            f"the file is not a list of tasks ({error})", where=file, expected="a file that `analyze construct` wrote"
+            f"the file is not a list of tasks ({error})",
+            where=file,
+            expected="a file that `analyze construct` or `analyze grade` wrote",
         ) from error
     if listed.seed != seed:
         raise PipelineError(

@@ -211,7 +211,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
         if upload.tag is not None:  # An earlier upload may have the tag, which then moves.
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
-            api.create_tag(repository, tag=upload.tag, repo_type="dataset")
+            api.create_tag(repository, tag=upload.tag, revision=commit.oid, repo_type="dataset")
     except UPLOAD_ERRORS as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url

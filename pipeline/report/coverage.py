@@ -1,13 +1,14 @@
 """Panels for each axis: the parameters of a run next to those of the test tasks, and the distances between them."""
 
 from collections.abc import Sequence
+from itertools import chain
 from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.axes import AXES
-from pipeline.axes.report_data import KeptPerturbation
+from pipeline.axes.report_data import KeptPerturbation, groups_of
 from pipeline.planning import leakage
 from pipeline.report import figures
 from pipeline.report.figures import Panel
@@ -18,9 +19,10 @@ LABEL_WIDTH = 28
 
 
 class AxisPlots(NamedTuple):
-    """A note on the test set, and the plots of one axis."""
+    """A note on the test set, and the plots of one axis with the names of their groups."""
 
     note: str
+    groups: list[str]
     panels: list[Panel]
 
 
@@ -31,7 +33,8 @@ def plot_axis(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet) -
     unit = AXES[axis].kinds[0].unit
     if unit is not None and test.on_axis(axis):
         panels.append(_distances(axis, kept, test, unit))
-    return AxisPlots(note, panels)
+    groups = dict.fromkeys([axis, *chain.from_iterable(map(groups_of, plots))])
+    return AxisPlots(note, [*groups], panels)
 
 
 def _distances(axis: str, kept: Sequence[KeptPerturbation[Any]], test: TestSet, unit: str) -> Panel:

@@ -57,8 +57,8 @@ class LanguageModel:
         """Check the endpoint's address and the key, which an error does not show."""
         try:
             address = urllib.parse.urlsplit(self.endpoint)
-            is_address = address.scheme in ("http", "https") and bool(address.hostname)
-        except ValueError:
+            is_address = address.scheme in ("http", "https") and bool(address.hostname) and address.port != 0
+        except ValueError:  # such as a port that is no number
             is_address = False
         if not is_address:
             raise PipelineError(
@@ -147,9 +147,17 @@ class LanguageModel:
         )
 
 
+_HOST = re.compile(r"([a-z]+://)?([^/:]*|\[[0-9a-fA-F:.]*\])(:\d*)?(/(?!/).*)?")
+"""Address without user and password, query and fragment."""
+
+
 def _without_secrets(address: str) -> str:
-    """Return an address for messages: the part after user and password, without query and fragment."""
-    return re.split("[?#]", address.rpartition("@")[2])[0]
+    """Return an address for messages: the part after user and password, without query and fragment.
+
+    A malformed address may have a part of a password before its first ``?`` or ``#``, and is not shown.
+    """
+    shown = re.split("[?#]", address)[0].rpartition("@")[2]
+    return shown if _HOST.fullmatch(shown) else "(not shown)"
 
 
 def _key() -> str:

@@ -50,7 +50,7 @@ def brief(bddl_file: Path) -> dict[str, Any]:
         PipelineError: when the file cannot be read or does not define a task.
     """
     bddl = read(bddl_file)
-    suite, name = bddl_file.resolve().parent.name, bddl_file.stem
+    suite, name = bddl_file.absolute().parent.name, bddl_file.stem
     instructions = {task.name: task.instruction for task in tasks(suite)} if suite in SUITES else {}
     kinds = Counter([*bddl.objects.values(), *bddl.fixtures.values()])
     return {
@@ -196,12 +196,16 @@ def listed(answer: str) -> list[str]:
     Text around the list (preambles, code fences, a model's thoughts) is ignored.
     """
     answer = _THOUGHT.sub("", answer)
-    try:
-        items = json.loads(answer[answer.find("[") : answer.rfind("]") + 1])
-    except (ValueError, RecursionError):
-        marked = [_MARKED.match(line) for line in answer.splitlines()]
-        return [match[1] or match[2] for match in marked if match]
-    return [item if isinstance(item, str) else _only_text(item) for item in items]
+    for bracket in re.finditer(r"\[", answer):
+        try:
+            items, _ = json.JSONDecoder().raw_decode(answer, bracket.start())
+        except (ValueError, RecursionError):
+            continue
+        texts = [item if isinstance(item, str) else _only_text(item) for item in items]
+        if any(texts):
+            return texts
+    marked = [_MARKED.match(line) for line in answer.splitlines()]
+    return [match[1] or match[2] for match in marked if match]
 
 
 def _only_text(item: object) -> str:

@@ -225,7 +225,7 @@ class _FileJob:
         return demo_file(self.root, self.task)
 
     def _place(self, entry: DemoEntry) -> str:
-        return f"{self.root / entry.source.split()[0]} data/{entry.key}"
+        return f"{self._file} data/{entry.key}"
 
     def limit_s(self) -> float:
         """Return the time after which the job counts as hanging.

@@ -165,12 +165,19 @@ def unreadable(made: Episode) -> Episode:
     return replace(made, frames={**made.frames, "wrist_image": [small, *made.frames["wrist_image"][1:]]})
 
 
+def cut_short(made: Episode) -> Episode:
+    """The first frame ends within the header of its file."""
+    head = Jpeg(made.frames["image"][0][:100])
+    return replace(made, frames={**made.frames, "image": [head, *made.frames["image"][1:]]})
+
+
 FAULTS: dict[str, Callable[[Episode], Episode]] = {
     "c: has no instruction": lambda made: replace(made, instruction=" "),
     "c: has 7 steps, fewer than a chunk of 8": partial(first, steps=7),
     "c: action leaves": lambda made: replace(made, action=made.action * 2),
     "c: state is not finite": lambda made: replace(made, state=np.full_like(made.state, np.nan)),
     "c: wrist_image: 1 of 19 frames": unreadable,
+    "c: image: 1 of 19 frames": cut_short,
 }
 
 

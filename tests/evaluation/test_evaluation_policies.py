@@ -228,7 +228,7 @@ def test_a_checkpoint_of_renamed_images_acts_like_one_of_ours(tmp_path: Path) ->
 def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
     with running(FAULTY_SERVER) as address:
         policy = PolicyConfig(kind="server", address=address, label="faulty", timeout_s=10)
-        with pytest.raises(PipelineError, match="2 episodes have no result") as raised:
+        with pytest.raises(PipelineError, match="2 episodes without a result") as raised:
             evaluate(Evaluation(RECORDED, policy, policy.identity(), tmp_path), FAULTY_AND_STOVE, loop)
     for told in ("within 10 s", "pick_up_the_milk", "no such camera", "push_the_plate"):
         assert told in str(raised.value)

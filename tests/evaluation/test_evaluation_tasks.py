@@ -37,6 +37,24 @@ def test_libero_has_an_episode_for_each_task_and_initial_state() -> None:
     assert libero_states(STOVE).shape[0] == 50
 
 
+def test_what_is_chosen_twice_is_selected_once() -> None:
+    once = {"source": "own", "suites": ("libero_goal",), "axes": ("camera", "noise"), "levels": (2, 1)}
+    twice = {name: value if name == "source" else 2 * value for name, value in once.items()}  # type: ignore[operator]
+    assert select(Selection.model_validate(twice)) == select(Selection.model_validate(once))
+    pairs = Selection(source="pairs", suites=("libero_goal",), axes=("camera", "camera", "noise"))
+    assert select(pairs) == select(pairs.model_copy(update={"axes": ("camera", "noise")}))
+
+
+def test_a_folder_of_another_program_is_rejected_and_one_of_a_stopped_evaluation_is_not(tmp_path: Path) -> None:
+    files = EpisodeFiles(tmp_path)
+    files.video("an episode").parent.mkdir()
+    files.video("an episode").touch()
+    files.reject_other_folder()
+    (tmp_path / "model.safetensors").touch()
+    with pytest.raises(PipelineError, match="the folder has files but no results of an evaluation: model"):
+        files.reject_other_folder()
+
+
 @pytest.mark.slow
 def test_test_tasks_that_need_no_archive_are_all_there(capsys: pytest.CaptureFixture[str]) -> None:
     tasks = select(Selection(source="libero_plus"))

@@ -1,6 +1,7 @@
 """Focus of a plan on failures: shares computed by hand, limits, all three forms of results, and a written file."""
 
 import json
+import math
 from collections import Counter
 from itertools import chain
 from pathlib import Path
@@ -130,6 +131,12 @@ def test_results_on_other_tasks_axes_and_levels_do_not_count() -> None:
     focused = focus(weak, [*plain, *others], None)
     assert (focused.policies, focused.left_out) == ({"act": 20}, 40)
     assert focused.reasons == focus(weak, plain, None).reasons
+
+
+@pytest.mark.parametrize("name", ["floor", "cap"])
+def test_a_limit_that_is_no_number_is_rejected(name: str) -> None:
+    with pytest.raises(PipelineError, match=f"--{name}: the limit is not a number"):
+        Limits(**{name: math.nan})
 
 
 @pytest.mark.parametrize("limits", [Limits(1, 2), Limits(0.5, 1), Limits(1, 1), Limits(0, 100), Limits(0, 1)])

@@ -205,8 +205,8 @@ class Hub:
             "commitOid": self.head(),
         }
 
-    def tag(self, body: bytes) -> tuple[int, object]:
-        self.tags[json.loads(body)["tag"]] = self.commits
+    def tag(self, body: bytes, commit: str) -> tuple[int, object]:
+        self.tags[json.loads(body)["tag"]] = int(commit, 16)
         return 200, {}
 
     def untag(self, body: bytes, name: str) -> tuple[int, object]:
@@ -235,6 +235,6 @@ ROUTES: dict[str, Callable[..., tuple[int, object]]] = {
     f"POST /api/datasets/{REPOSITORY}/preupload/main": Hub.modes,
     f"POST /datasets/{REPOSITORY}.git/info/lfs/objects/batch": Hub.batch,
     f"POST /api/datasets/{REPOSITORY}/commit/main": Hub.commit,
-    f"POST /api/datasets/{REPOSITORY}/tag/main": Hub.tag,
+    f"POST /api/datasets/{REPOSITORY}/tag/([0-9a-f]{{40}})": Hub.tag,
     f"DELETE /api/datasets/{REPOSITORY}/tag/(.+)": Hub.untag,
 }

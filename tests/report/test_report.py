@@ -210,6 +210,8 @@ def test_every_axis_has_a_plot_of_its_perturbations(name: str) -> None:
     shown = coverage.plot_axis(name, kept, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert shown.panels
     assert f"{len(benchmark.load(REPOSITORY / benchmark.FOLDER).on_axis(name)):,}" in shown.note
+    next_to_tests = name in ("camera", "language", "layout", "noise", "pose", "robot")
+    assert shown.groups == ([name, "benchmark"] if next_to_tests else [name])
     for panel in shown.panels:
         assert panel.svg.startswith("<svg")
         assert figures.colour(name) in panel.svg or "data:image/png" in panel.svg

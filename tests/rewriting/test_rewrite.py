@@ -157,6 +157,14 @@ def test_the_question_says_what_is_in_the_scene_and_what_is_wanted(server: Serve
     assert load_bank()[STOVE.suite][STOVE.name][CLASSES[0]][0] in questions[0]
 
 
+def test_a_link_to_a_definition_has_the_suite_and_the_name_of_the_link(tmp_path: Path) -> None:
+    link = tmp_path / "my_suite" / "my_task.bddl"
+    link.parent.mkdir()
+    link.symlink_to(STOVE.bddl_file)
+    told = rewrite.brief(link)["task"]
+    assert (told.suite, told.name, told.bddl_file) == ("my_suite", "my_task", link)
+
+
 def test_two_of_a_kind_are_told_apart(server: Server) -> None:
     task = find_task(
         "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
@@ -179,6 +187,9 @@ GOOD = "please light the big stove"
         f"Here are 2 variations of the instruction:\n\n1. {GOOD.capitalize()}.\n",
         f"Of course, with pleasure\n- “{GOOD}”\n",
         json.dumps([{"rewrite": GOOD}]),
+        f'["{GOOD}"]\n[Note: letters only]',
+        f"```json\n[\n{json.dumps(GOOD)}\n]\n```\nsee [docs]",
+        f"Here are the rewrites [1]:\n1. {GOOD}",
         f'["{GOOD}",\n"cut short before the e',
         f'[\n  "{GOOD}",\n  "cut short before the e',
         json.dumps(
@@ -336,6 +347,10 @@ def test_messages_show_neither_the_password_nor_the_query_of_an_endpoint(server:
         LanguageModel(f"{address}?token=secret", "tiny")("hello")
     assert "secret" not in str(caught.value)
     assert server.url.removeprefix("http://") in str(caught.value)
+    with pytest.raises(PipelineError, match="401") as caught:
+        LanguageModel(f"{server.url}?key=top@secret", "tiny")("hello")
+    assert "secret" not in str(caught.value)
+    assert server.url in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -347,6 +362,8 @@ def test_messages_show_neither_the_password_nor_the_query_of_an_endpoint(server:
         "me:secret@h:8000/v1",
         "ftp://me:secret@h",
         "http://me:secret@[::",
+        "http://me:secret?half@h",
+        "http://me:secret#half@h/v1",
     ],
 )
 def test_an_endpoint_that_is_no_address_is_rejected(endpoint: str) -> None:

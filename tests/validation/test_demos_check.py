@@ -254,7 +254,10 @@ def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     link_testset(root)
     text, goal = BOWL.bddl_file.read_text(), "(And (On akita_black_bowl_1 plate_1))"
     assert goal in text
-    for name, wanted in {"bowl_away": goal, "bowl_cooks": goal.replace("plate_1", "flat_stove_1_cook_region")}.items():
+    for name, wanted in {
+        "bowl_away": goal,
+        "bowl_cooks there": goal.replace("plate_1", "flat_stove_1_cook_region"),
+    }.items():
         definition, file = Path(f"tasks/my_suite/{name}.bddl"), Path(f"own/my_suite/{name}_demo.hdf5")
         for path in (definition, file):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -265,7 +268,7 @@ def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = check(Path("own"), 2, loop)
     assert (found.files, found.demonstrations, found.missed) == (2, 4, ["my_suite/bowl_away/demo_1"])
     missing = [fault.split("my_suite/")[1].split(",")[0] for fault in found.faults]
-    assert missing == [f"bowl_cooks_demo.hdf5 data/demo_{n}: the demonstration misses its goal" for n in (0, 1)]
+    assert missing == [f"bowl_cooks there_demo.hdf5 data/demo_{n}: the demonstration misses its goal" for n in (0, 1)]
 
     said = {"name": "own", "demos": {"root": "own", "tasks": ["my_suite/*"]}, "plan": {"episodes": {"camera": 1}}}
     config = Config.model_validate(said)
