@@ -38,10 +38,10 @@ from pipeline.run.layout import (
     PLAN,
     PREVIEWS,
     REPLAY,
+    REPORTS,
     SETTINGS,
     SHEETS,
     STATISTICS,
-    VALIDATION,
 )
 from pipeline.run.outcome import outdated, rejections
 from pipeline.run.render_stage import render_plan
@@ -335,7 +335,6 @@ def _changed_frames(run: Run) -> Path | None:
 
 _OUTCOME = (PLAN, TRAJECTORIES_TABLE, FRAMES_TABLE)
 _RECORDS = tuple(f"{kind.name}.json" for kind in registry.FORMATS)
-_REPORTS = (LEAKAGE, VALIDATION, STATISTICS)
 _LABELLED = ("filter", "export", "plan")
 """Settings of stages that list rewrites: they depend on the plan's language axis and, by ``INPUTS``, on the bank."""
 
@@ -363,7 +362,7 @@ STAGES = {
     "validate": Stage(validate),
     "recipe": Stage(write_recipe, ("export", "finetune"), (MANIFEST, *_RECORDS), (FINETUNE,)),
     "summary": Stage(summarize),
-    "card": Stage(write_card, inputs.PUBLISHED, (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
+    "card": Stage(write_card, inputs.PUBLISHED, (MANIFEST, *REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
     "report": Stage(write_report),
 }
 """Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""

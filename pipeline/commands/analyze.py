@@ -170,15 +170,15 @@ def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on
     only an evaluation of the candidates shows it: with --results, these tasks are left out. The last line of the output
     is JSON.
     """
-    from pipeline.evaluation import held_out, selection
+    from pipeline.evaluation import construction, held_out
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.task_list import reject_other_list, write_tasks
 
     reject_other_list(out)
     rows = [row for row, _ in stored(results)]
     plan = held_out.planned(open_run(trained_on).plan_file) if trained_on else None
-    candidates = selection.candidates(seed)
-    chosen, counts = selection.construct(candidates, seed, size or selection.SIZE, rows, plan)
+    candidates = construction.candidates(seed)
+    chosen, counts = construction.construct(candidates, seed, size or construction.SIZE, rows, plan)
     write_tasks(chosen, seed, out)
     print(json.dumps(counts))
 
@@ -192,7 +192,7 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
     The command writes a list of the tasks with their difficulty, which `evaluate --tasks-from` reads. The last line of
     the output is JSON.
     """
-    from pipeline.evaluation import statistics
+    from pipeline.evaluation import grading
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.task_list import reject_other_list, write_tasks
 
@@ -206,7 +206,7 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
         raise PipelineError(
             f"the results have the seeds {sorted(seeds)}", expected="one seed, and therefore the same perturbations"
         )
-    graded = statistics.grade(results)
+    graded = grading.grade(results)
     write_tasks(graded, seed, out)
     difficulties = [task["difficulty"] for task in graded]
     by_level = {level: difficulties.count(level) for level in range(1, 6)}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from textwrap import wrap
@@ -164,6 +164,20 @@ def model_options(model: type[BaseModel], **options: str) -> Callable[[Any], Any
     return decorate
 
 
+_BOUNDS = {"ge": ("min", False), "gt": ("min", True), "le": ("max", False), "lt": ("max", True)}
+"""Attribute of a field's limit to the end of the range, and whether the range excludes it."""
+
+
+def _bounds(limits: Sequence[Any]) -> dict[str, Any]:
+    """Return the limits of a field as arguments of click's ranges."""
+    bounds: dict[str, Any] = {}
+    for limit in limits:
+        for name, (end, is_open) in _BOUNDS.items():
+            if hasattr(limit, name):
+                bounds |= {end: getattr(limit, name), f"{end}_open": is_open}
+    return bounds
+
+
 def _field_option(model: type[BaseModel], name: str, option: str) -> Callable[[Any], Any]:
     field = model.model_fields[name]
     kind, default = field.annotation, field.default
@@ -177,9 +191,9 @@ def _field_option(model: type[BaseModel], name: str, option: str) -> Callable[[A
     elif kind_of_value is Path:
         parameter_type = PATH
     elif field.metadata and kind_of_value is int:
-        parameter_type = click.IntRange(min=1)
+        parameter_type = click.IntRange(**_bounds(field.metadata))
     elif field.metadata and kind_of_value is float:
-        parameter_type = click.FloatRange(min=0, min_open=True)
+        parameter_type = click.FloatRange(**_bounds(field.metadata))
     help_text = str(field.description).replace("\n", " ").replace("``", "")
     help_text = help_text[:1].upper() + help_text[1:]
     if default not in (None, "", ()):

@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from pipeline.compute.cluster import Workplace, in_place, workplace_of
 from pipeline.compute.progress import progress_of
 from pipeline.compute.slurm import slurm_jobs
-from pipeline.compute.workers import ended, local_cluster
+from pipeline.compute.workers import local_cluster, lost_workers
 from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
@@ -181,7 +181,7 @@ class _Workers:
         results: dict[int, Result] = {}
         deadly: list[int] = []
         sizes = _sizes(fn, items)
-        with progress_of(description, sum(sizes)) as advance, closing(self._ended(work, items)) as outcomes:
+        with progress_of(description, sum(sizes)) as advance, closing(self._outcomes(work, items)) as outcomes:
             for number, outcome in outcomes:
                 if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
                     deadly.append(number)
@@ -190,7 +190,7 @@ class _Workers:
                 advance(sizes[number])
             for number in deadly:
                 # Try it alone: another item may have ended the workers that had this item too.
-                ((_, outcome),) = self._ended(work, [items[number]])
+                ((_, outcome),) = self._outcomes(work, [items[number]])
                 if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
                     results[number] = fn.lost(items[number])
                 else:
@@ -198,7 +198,7 @@ class _Workers:
                 advance(sizes[number])
         return [results[number] for number in range(len(items))]
 
-    def _ended(
+    def _outcomes(
         self, work: Callable[[Item], Result], items: Sequence[Item]
     ) -> Generator[tuple[int, Result | Exception]]:
         """Yield the number of each item and its result or error, in the order in which items end."""
@@ -275,7 +275,7 @@ def _result(outcome: Result | Exception) -> Result:
 
     if isinstance(outcome, KilledWorker):
         what = f"one item of work ended {outcome.allowed_failures + 1} workers"
-        raise ended(what, f"last worker {outcome.last_worker.address}")
+        raise lost_workers(what, f"last worker {outcome.last_worker.address}")
     if isinstance(outcome, Exception):
         raise outcome
     return outcome

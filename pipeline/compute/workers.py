@@ -51,7 +51,7 @@ def local_cluster(workers: int | None, renders: bool) -> Iterator[tuple[Any, Cal
     os.environ.update(VARIABLES)
     # Software GL would also start a thread for every core; with fewer workers than cores, it uses the remaining cores.
     os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
-    with _ended(_started(workers)) as cluster, Client(cluster) as client:
+    with _closing(_started(workers)) as cluster, Client(cluster) as client:
         client.run(_leave_interrupts_to_the_run)
         if renders:
             _have_rendered_alike(client, workers)
@@ -85,10 +85,10 @@ def _started(workers: int) -> Any:
             )
         except RuntimeError as error:
             failure = error
-    raise ended(f"worker processes ended while they started, {STARTS} times") from failure
+    raise lost_workers(f"worker processes ended while they started, {STARTS} times") from failure
 
 
-def ended(what: str, where: str | None = None) -> PipelineError:
+def lost_workers(what: str, where: str | None = None) -> PipelineError:
     """Return the error for workers that ended for an unknown reason."""
     expected = "workers that finish their work; the system may have ended them because memory ran out"
     remedy = f"read the system's log, reduce compute.workers, and {GO_ON}"
@@ -96,7 +96,7 @@ def ended(what: str, where: str | None = None) -> PipelineError:
 
 
 @contextmanager
-def _ended(cluster: Any) -> Iterator[Any]:
+def _closing(cluster: Any) -> Iterator[Any]:
     """End the workers when the block ends.
 
     On a busy machine they may take longer than Dask waits. They then end with this process, and their finished work

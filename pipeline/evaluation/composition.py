@@ -47,7 +47,7 @@ TITLE = "perturbed-demos: compositional gap"
 
 
 @dataclass(frozen=True)
-class Pair:
+class AxisPair:
     """Pair of axes, and the successes of their four combinations.
 
     Attributes:
@@ -134,7 +134,7 @@ def _probabilities(sums: Floats) -> tuple[Floats, Floats]:
     return np.asarray(both / whole, float), np.asarray(product, float)
 
 
-def pairs(results: Iterable[Stored]) -> list[Pair]:
+def pairs(results: Iterable[Stored]) -> list[AxisPair]:
     """Count the successes of every pair of axes among results, over the trials with all four combinations.
 
     Raises:
@@ -152,7 +152,7 @@ def pairs(results: Iterable[Stored]) -> list[Pair]:
     for axis, _, _ in combined:
         if axis != "clean":
             perturbed_axes += axis.split("+")
-    counted: list[Pair] = []
+    counted: list[AxisPair] = []
     for first_axis, second_axis in combinations(_in_order(perturbed_axes), 2):
         pair = _pair(first_axis, second_axis, combined)
         if pair is not None:
@@ -167,7 +167,7 @@ def pairs(results: Iterable[Stored]) -> list[Pair]:
 
 def _pair(
     first_axis: str, second_axis: str, combined: Mapping[tuple[str, int, tuple[str, str, int]], EpisodeResult]
-) -> Pair | None:
+) -> AxisPair | None:
     """Count the trials of two axes; return `None` if there are no trials.
 
     The bootstrap resamples all trials of one initial state together, across levels. A trial is left out if its pair
@@ -198,7 +198,7 @@ def _pair(
         return None
     measured = interval([start[:2] for start in starts], starts, np.array(outcomes), gap)
     neither, only_first, only_second, both = np.sum(outcomes, axis=0).tolist()
-    return Pair(first_axis, second_axis, len(starts), neither, only_first, only_second, both, measured)
+    return AxisPair(first_axis, second_axis, len(starts), neither, only_first, only_second, both, measured)
 
 
 def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
@@ -212,7 +212,7 @@ def _in_order(axes: Iterable[str]) -> list[str]:
     return list(axes_of("+".join(once))) if once else []
 
 
-def matrix(measured: Sequence[Pair]) -> tuple[list[str], Floats]:
+def matrix(measured: Sequence[AxisPair]) -> tuple[list[str], Floats]:
     """Return the N axes, and an (N, N) matrix of probabilities.
 
     The matrix has the product of the two marginal probabilities above the diagonal and the joint probability below it.
@@ -229,7 +229,7 @@ def matrix(measured: Sequence[Pair]) -> tuple[list[str], Floats]:
     return names, probabilities
 
 
-def heatmap(measured: Sequence[Pair], file: Path) -> None:
+def heatmap(measured: Sequence[AxisPair], file: Path) -> None:
     """Plot the matrix of ``matrix`` as a heat map, in the paper's layout, and save it as a PNG file."""
     names, probabilities = matrix(measured)
     figure = Figure(figsize=(1.6 + 0.9 * len(names), 1.2 + 0.8 * len(names)), layout="constrained")

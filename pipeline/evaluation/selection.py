@@ -1,16 +1,10 @@
-"""Selection of the tasks to evaluate on: tasks that a user names, or a benchmark constructed like LIBERO-Plus.
-
-LIBERO-Plus sampled 500 candidates of each of its seven dimensions in each of four suites, filtered them, and balanced
-them to 10,030 tasks. Here, this project's axes with held-out perturbations take the place of the seven dimensions, if
-the benchmark tests them. LIBERO-Plus's layout corresponds to the axes layout and pose. Language has no held-out
-perturbations.
-"""
+"""Selection of the tasks to evaluate on: tasks that a user names."""
 
 import difflib
 import fnmatch
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from itertools import chain, combinations, count, islice, product
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,11 +15,10 @@ from pipeline.axes.base import LEVELS
 from pipeline.axes.component_names import ComponentName
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
-from pipeline.evaluation.held_out import OWN_AXES, PlannedPerturbations, held_out_task, sample_perturbation
-from pipeline.evaluation.results import REJECTED, EpisodeResult
+from pipeline.evaluation.held_out import OWN_AXES, held_out_task
 from pipeline.evaluation.task_list import read_tasks
 from pipeline.evaluation.tasks import EvaluationTask, balanced, carried_tasks, libero_task, replacements
-from pipeline.libero.tasks import SUITES, find_task, suites, tasks
+from pipeline.libero.tasks import SUITES, suites, tasks
 from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Frozen, Task
 
@@ -39,12 +32,6 @@ PAIR_AXES = tuple(name for name in OWN_AXES if AXES[name].dimension == name)
 """Axes of the six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise.
 
 Each has the name of its dimension; pose is a second axis of the dimension layout."""
-
-CANDIDATES = 500
-"""Number of candidates of each axis in each suite, spread evenly over tasks and levels."""
-
-SIZE = 10_000
-"""Number of tasks in the benchmark; LIBERO-Plus has 10,030."""
 
 
 class Selection(Frozen, use_attribute_docstrings=True):
@@ -303,74 +290,3 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
     if missing:
         print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")
     return left
-
-
-def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
-    """Sample ``each`` held-out perturbations on every axis that the benchmark tests, in every suite.
-
-    No scene is built.
-    """
-    sampled: list[EvaluationTask] = []
-    tested = [axis for axis in OWN_AXES if load().on_axis(axis)]
-    for suite, axis in product(TESTED_SUITES, tested):
-        sampled += islice(_held_out_tasks(suite, axis, seed), each)
-    return sampled
-
-
-def _held_out_tasks(suite: str, axis: str, seed: int) -> Iterator[EvaluationTask]:
-    """Yield a suite's tasks with held-out perturbations on one axis, without end.
-
-    The number of a perturbation increases after all tasks and levels had one, so initial states differ too.
-    """
-    for number in count():
-        for level, task in product(LEVELS, tasks(suite)):
-            perturbed = held_out_task(task, axis, level, number, seed)
-            if perturbed is not None:
-                yield perturbed
-
-
-def construct(
-    sampled: Sequence[EvaluationTask],
-    seed: int,
-    size: int = SIZE,
-    results: Iterable[EpisodeResult] = (),
-    plan: PlannedPerturbations | None = None,
-) -> tuple[list[EvaluationTask], dict[str, Any]]:
-    """Filter candidates, and choose tasks evenly: axes in turn, for each axis its components, then levels, then suites.
-
-    Args:
-        results: episodes of candidates that were run; candidates whose scene was rejected are left out.
-        plan: a training plan; candidates whose first perturbation overlaps with it are left out. If the scene rejects
-            the first perturbation, the next ones are compared when an evaluation gets the plan.
-
-    Returns:
-        The benchmark's tasks, and the numbers of tasks and of left-out candidates by kind, JSON-serialisable.
-
-    Raises:
-        PipelineError: if a result has another seed, because its perturbations differ under equal names.
-    """
-    rejected = set()
-    for row in results:
-        if row.seed != seed:
-            raise PipelineError(
-                f"the result has seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
-            )
-        if row.reason == REJECTED:
-            rejected.add(str(row))
-    accepted = [task for task in sampled if str(task) not in rejected]
-    apart = accepted
-    if plan is not None:
-        apart = [
-            task
-            for task in accepted
-            if not plan.overlap(sample_perturbation(task, seed), find_task(task.suite, task.base))
-        ]
-    chosen = balanced(apart, size, seed)
-    return chosen, {
-        "candidates": len(sampled),
-        "refused": len(sampled) - len(accepted),
-        "overlapping": len(accepted) - len(apart),
-        "tasks": len(chosen),
-        "by_axis": dict(sorted(Counter(task.axis for task in chosen).items())),
-        "by_component": dict(sorted(Counter(f"{task.axis}/{task.component}" for task in chosen).items())),
-    }

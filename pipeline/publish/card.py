@@ -28,12 +28,9 @@ from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, Diversity, diversity, named, origins, tally, targets, tried
 from pipeline.run.inputs import published_settings
-from pipeline.run.layout import CARD, FINETUNE, MANIFEST, SHEETS
+from pipeline.run.layout import CARD, FINETUNE, MANIFEST, REPORTS, SHEETS
 from pipeline.run.run import Run
 from pipeline.testset import benchmark
-
-REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
-"""Files in the run's folder from which the card is generated, in addition to the manifest."""
 
 CHECKSUMS = "SHA256SUMS"
 """File with the checksums of a repository's files, for ``sha256sum --check``."""

@@ -11,7 +11,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import reject_other_file, write
 from pipeline.report.paper_table import DIMENSIONS
 
-COLUMNS = (*DIMENSIONS, "total", "mean of seven")
+HEADINGS = (*DIMENSIONS, "total", "mean of seven")
 """Headings of the rates."""
 
 SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal": "goal", "libero_10": "long"}
@@ -20,9 +20,9 @@ SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal":
 NOT_STATED = "not stated"
 
 MARKS = {
-    ".md": f"| model | {' | '.join(COLUMNS)} |",
+    ".md": f"| model | {' | '.join(HEADINGS)} |",
     ".csv": "model,published,program,prompt,step_limits",
-    ".tex": f"% model & {' & '.join(COLUMNS)} \\\\",
+    ".tex": f"% model & {' & '.join(HEADINGS)} \\\\",
 }
 """Suffix of each file to a text that all these files contain."""
 
@@ -101,7 +101,7 @@ def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
     counts = {**tasks_run, "total": sum(tasks_run.values())}
     whole = {**sizes, "total": sum(sizes.values())}
     sampled: dict[str, str] = {}
-    for heading in COLUMNS:
+    for heading in HEADINGS:
         counted = heading if heading in counts else "total"  # The mean of seven is over all tasks, too.
         if heading in measured and heading not in partial and counts[counted] < whole[counted]:
             sampled[heading] = f"{counts[counted]:,} of {whole[counted]:,}"
@@ -116,7 +116,7 @@ def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
         left_out=protocol["left_out"],
         black=protocol["black"],
         mixed_versions=", ".join(f"{name} {' and '.join(found)}" for name, found in protocol["mixed_versions"].items()),
-        rates={heading: _percent(measured[heading]["rate"]) if heading in measured else None for heading in COLUMNS},
+        rates={heading: _percent(measured[heading]["rate"]) if heading in measured else None for heading in HEADINGS},
         intervals={
             heading: (_percent(estimate["low"]), _percent(estimate["high"])) for heading, estimate in measured.items()
         },
@@ -141,7 +141,7 @@ def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> Row:
         left_out=0,
         black="none",
         mixed_versions="",
-        rates={heading: f"{rates[heading]:.1f}" for heading in COLUMNS},
+        rates={heading: f"{rates[heading]:.1f}" for heading in HEADINGS},
         intervals={},
         partial=frozenset(),
         sampled={},
@@ -167,16 +167,16 @@ def _limits(limits: Mapping[str, Sequence[int]]) -> str:
 
 def markdown(table: Mapping[str, Any]) -> str:
     """Return the table as Markdown, with the protocol of each evaluated policy and the left-out parts."""
-    lines = [MARKS[".md"], f"|---|{'---:|' * len(COLUMNS)}"]
+    lines = [MARKS[".md"], f"|---|{'---:|' * len(HEADINGS)}"]
     rows = rows_of(table)
     sizes = {**table["tasks"], "total": sum(table["tasks"].values())}
     for row in rows:
-        cells = [_marked(row, heading, "*", "†") or "-" for heading in COLUMNS]
+        cells = [_marked(row, heading, "*", "†") or "-" for heading in HEADINGS]
         lines.append(_line(f"{row.name} (published)" if row.published else row.name, cells))
         if not row.published:
-            bounds = [" to ".join(row.intervals[name]) if name in row.intervals else "" for name in COLUMNS]
+            bounds = [" to ".join(row.intervals[name]) if name in row.intervals else "" for name in HEADINGS]
             lines.append(_line(f"{row.name}, 95 % interval", bounds))
-            counts = [f"{row.tasks_run[name]:,} of {sizes[name]:,}" if name in sizes else "" for name in COLUMNS]
+            counts = [f"{row.tasks_run[name]:,} of {sizes[name]:,}" if name in sizes else "" for name in HEADINGS]
             lines.append(_line(f"{row.name}, tasks run", counts))
     lines.append("")
     for row in rows:
@@ -245,7 +245,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
     """Return the table as CSV, one line for each model; cells that were not measured are empty."""
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
-    named = {heading: heading.replace(" ", "_") for heading in COLUMNS}
+    named = {heading: heading.replace(" ", "_") for heading in HEADINGS}
     counted = (*DIMENSIONS, "total")
     writer.writerow(
         [
@@ -262,7 +262,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
     )
     for row in rows_of(table):
         bounds: list[str] = []
-        for heading in COLUMNS:
+        for heading in HEADINGS:
             bounds += row.intervals.get(heading, ("", ""))
         writer.writerow(
             [
@@ -275,7 +275,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
                 row.left_out,
                 row.black,
                 row.mixed_versions,
-                *(row.rates[heading] or "" for heading in COLUMNS),
+                *(row.rates[heading] or "" for heading in HEADINGS),
                 *(row.tasks_run[name] for name in counted),
                 *bounds,
                 "; ".join(f"{column}: {parts}" for column, parts in row.absent.items()),
@@ -290,7 +290,7 @@ def latex(table: Mapping[str, Any]) -> str:
     for row in rows_of(table):
         if row.published:
             continue
-        cells = [_marked(row, heading, "$^{*}$", r"$^{\dagger}$") or "--" for heading in COLUMNS]
+        cells = [_marked(row, heading, "$^{*}$", r"$^{\dagger}$") or "--" for heading in HEADINGS]
         name = "".join(LATEX.get(character, character) for character in " ".join(row.name.split()))
         # After the end of the line before, `[` and `*` would begin an option of that end.
         name = f"{{}}{name}" if name.startswith(("[", "*")) else name

@@ -22,7 +22,7 @@ PUBLISHED = Path(__file__).with_name("published.yaml")
 DIMENSIONS = ("camera", "robot", "language", "light", "background", "noise", "layout")
 """The paper's dimensions, in the order of its tables."""
 
-COLUMNS = {
+AXES_OF_DIMENSION = {
     dimension: tuple(name for name, axis in AXES.items() if axis.dimension == dimension) for dimension in DIMENSIONS
 }
 """The paper's dimensions to this project's axes."""
@@ -116,13 +116,13 @@ def paper_table(policies: Mapping[str, Sequence[Scored]]) -> dict[str, Any]:
         ``published``: rows with ``name``, ``rates`` by column in percent, ``total``, and ``mean`` and ``shared``, which
         are not in the paper.
     """
-    tasks = {column: _sizes(axes, 1).total() for column, axes in COLUMNS.items()}
+    tasks = {column: _sizes(axes, 1).total() for column, axes in AXES_OF_DIMENSION.items()}
     measured = {name: _cells(rows) for name, rows in policies.items()}
-    shared = set(COLUMNS).intersection(*measured.values())
-    shared_columns = [column for column in COLUMNS if column in shared]
+    shared = set(AXES_OF_DIMENSION).intersection(*measured.values())
+    shared_columns = [column for column in AXES_OF_DIMENSION if column in shared]
     evaluated = [_evaluated_row(name, cells, shared_columns, tasks) for name, cells in measured.items()]
     packed = yaml.safe_load(PUBLISHED.read_text())
-    equal = dict.fromkeys(COLUMNS, 1)
+    equal = dict.fromkeys(AXES_OF_DIMENSION, 1)
     published = []
     for name, row in packed["models"].items():
         rates = dict(zip(packed["columns"], row["rates"], strict=True))
@@ -143,9 +143,9 @@ def _evaluated_row(
     name: str, cells: Mapping[str, Estimate], shared: Sequence[str], tasks: Mapping[str, int]
 ) -> dict[str, Any]:
     """Collect the cells of an evaluated policy, its total, its mean and its total over the shared columns."""
-    whole = len(cells) == len(COLUMNS)
+    whole = len(cells) == len(AXES_OF_DIMENSION)
     total = _joined(cells, tasks) if whole else None
-    mean = _joined(cells, dict.fromkeys(COLUMNS, 1)) if whole else None
+    mean = _joined(cells, dict.fromkeys(AXES_OF_DIMENSION, 1)) if whole else None
     over_shared = _joined({column: cells[column] for column in shared}, tasks) if shared else None
     return {
         "name": name,
@@ -161,7 +161,7 @@ def _cells(rows: Iterable[Scored]) -> dict[str, Estimate]:
     outcomes = grouped(((row.suite, row.name), row.success) for row in rows)
     by_axis = grouped((test.axis, (test, successes)) for test, successes in _of_tests(outcomes))
     cells = {}
-    for column, axes in COLUMNS.items():
+    for column, axes in AXES_OF_DIMENSION.items():
         chosen = list(chain.from_iterable(by_axis.get(axis, ()) for axis in axes))
         if chosen:
             cells[column] = _cell(chosen, axes)

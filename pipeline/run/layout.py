@@ -20,3 +20,6 @@ CARD = "card"
 REPORT = "report.html"
 WORK = ".work"
 FINISHED = ".finished"
+
+REPORTS = (LEAKAGE, VALIDATION, STATISTICS)
+"""Files from which the card is generated, in addition to the manifest."""

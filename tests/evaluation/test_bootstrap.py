@@ -10,7 +10,7 @@ from episode_results import result
 from numpy.typing import NDArray
 
 from pipeline.evaluation import composition, statistics
-from pipeline.evaluation.composition import Pair, gap
+from pipeline.evaluation.composition import AxisPair, gap
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.statistics import Interval, compare, difference, interval, mcnemar
 from pipeline.evaluation.tasks import EvaluationTask
@@ -89,7 +89,7 @@ def test_of_a_sample_of_base_tasks_the_interval_covers_what_others_would_show(ba
     assert rejected(found) in EXPECTED if mean == 0 else rejected(found) > 150
 
 
-def gaps(joint_loss: float, base_tasks: int, trials: int, simulations: int) -> tuple[list[Pair], float]:
+def gaps(joint_loss: float, base_tasks: int, trials: int, simulations: int) -> tuple[list[AxisPair], float]:
     """Simulated pairs of axes, and the gap that they would have of endless trials.
 
     Base tasks differ by 4 points in all four rates. Each axis by itself takes 95 % of successes to 90 %; both together
@@ -103,7 +103,7 @@ def gaps(joint_loss: float, base_tasks: int, trials: int, simulations: int) -> t
         found = simulated(generator, rates + harder + np.zeros((base_tasks, 4)), [trials] * base_tasks)
         neither, one, other, both = found.outcomes.sum(axis=0).astype(int).tolist()
         interval_of_gap = found.interval(gap)
-        pairs.append(Pair("robot", "camera", base_tasks * trials, neither, one, other, both, interval_of_gap))
+        pairs.append(AxisPair("robot", "camera", base_tasks * trials, neither, one, other, both, interval_of_gap))
     return pairs, float(gap(rates[None])[0])
 
 
@@ -183,7 +183,7 @@ def test_outcomes_that_never_differ_have_no_interval() -> None:
     assert compare(pairs_of(10, 0, 0, 0))["all"]["difference"] == {"value": 0, **undefined, "resampled": "10 trials"}
     assert compare(pairs_of(0, 10, 0, 0))["all"]["difference"]["low"] is None
     assert compare(pairs_of(0, 1, 0, 0))["all"]["difference"]["low"] is None
-    assert Pair("robot", "camera", 10, 0, 0, 0, 0).figures()["bootstrap"] is None
+    assert AxisPair("robot", "camera", 10, 0, 0, 0, 0).figures()["bootstrap"] is None
     assert composition.gap(np.zeros((1, 4)))[0] != 0
 
 

@@ -16,7 +16,7 @@ from episode_results import analyze, result
 from pipeline.axes import to_json
 from pipeline.errors import PipelineError
 from pipeline.evaluation import composition
-from pipeline.evaluation.composition import Pair
+from pipeline.evaluation.composition import AxisPair
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.results import EpisodeFiles, Stored, stored
@@ -29,7 +29,7 @@ def some_pairs(**fields: Any) -> list[EvaluationTask]:
 
 
 def test_the_gap_is_as_worked_by_hand() -> None:
-    pair = Pair("robot", "camera", trials=100, neither=90, only_one=60, only_other=50, both=20)
+    pair = AxisPair("robot", "camera", trials=100, neither=90, only_one=60, only_other=50, both=20)
     # 220 successes: the joint probability is 20 / 220, the marginal ones are 80 / 220 and 70 / 220.
     assert pair.joint == pytest.approx(1 / 11)
     assert pair.product == pytest.approx(80 * 70 / 220**2)
@@ -40,9 +40,9 @@ def test_the_gap_is_as_worked_by_hand() -> None:
     indicators = np.repeat([[0, 0], [1, 0], [0, 1], [1, 1]], [90, 60, 50, 20], axis=0)
     assert pair.gap == pytest.approx(np.cov(indicators.T, bias=True)[0, 1])
     # Where each perturbation keeps its own share, whatever the other does, there is no gap.
-    assert Pair("robot", "camera", 100, 80, 40, 20, 10).gap == pytest.approx(0)
-    assert Pair("robot", "camera", 100, 80, 40, 20, 10).chi_square() == pytest.approx((0, 1))
-    assert Pair("robot", "camera", 10, 0, 0, 0, 0).figures()["gap"] is None
+    assert AxisPair("robot", "camera", 100, 80, 40, 20, 10).gap == pytest.approx(0)
+    assert AxisPair("robot", "camera", 100, 80, 40, 20, 10).chi_square() == pytest.approx((0, 1))
+    assert AxisPair("robot", "camera", 10, 0, 0, 0, 0).figures()["gap"] is None
 
 
 def test_pairs_reuse_the_perturbations_and_initial_states_of_their_singles() -> None:
@@ -84,14 +84,14 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
         EpisodeFiles(tmp_path).save(result(task, success, **ended))
     assert analyze("gap", str(tmp_path)) == 0
     (pair,) = composition.pairs(stored([tmp_path]))
-    assert replace(pair, interval=None) == Pair("robot", "noise", 2, neither=2, only_one=0, only_other=1, both=0)
+    assert replace(pair, interval=None) == AxisPair("robot", "noise", 2, neither=2, only_one=0, only_other=1, both=0)
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert printed["robot+noise"]["trials"] == 2
     assert printed["robot+noise"]["bootstrap"]["resampled"] == "2 trials"
     assert printed["robot+noise"]["papers_chi_square"] == {"statistic": None, "p_value": None}
     assert json.loads((tmp_path / "gap.json").read_text()) == printed
     assert (tmp_path / "gap.png").read_bytes().startswith(b"\x89PNG")
-    names, shown = composition.matrix([pair, Pair("robot", "camera", 100, 90, 60, 50, 20)])
+    names, shown = composition.matrix([pair, AxisPair("robot", "camera", 100, 90, 60, 50, 20)])
     assert names == ["robot", "camera", "noise"]
     assert shown[0, 1] == pytest.approx(80 * 70 / 220**2), "the product stands above the diagonal"
     assert shown[1, 0] == pytest.approx(1 / 11)

@@ -20,11 +20,12 @@ from pipeline.axes import level_of_test
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
+from pipeline.evaluation.grading import grade
 from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.libero_plus import moved_state, saved_array
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.statistics import grade, summary, wilson
+from pipeline.evaluation.statistics import summary, wilson
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task

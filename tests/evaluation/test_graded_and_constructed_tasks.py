@@ -13,10 +13,11 @@ from pipeline.axes import AXES
 from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out
+from pipeline.evaluation.construction import candidates, construct
+from pipeline.evaluation.grading import difficulty
 from pipeline.evaluation.held_out import OWN_AXES
 from pipeline.evaluation.results import EpisodeFiles, read
-from pipeline.evaluation.selection import Selection, candidates, construct, select
-from pipeline.evaluation.statistics import difficulty
+from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.task_list import write_tasks
 from pipeline.evaluation.tasks import EvaluationTask
 

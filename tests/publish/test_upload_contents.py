@@ -15,7 +15,7 @@ from validated_run import NAME, RUN, prepare, write_card, write_run
 
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, replaced
-from pipeline.publish.card import REPORTS
+from pipeline.run.layout import REPORTS
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ from pipeline.formats.lerobot import LeRobotConfig, LeRobotV21Config
 from pipeline.formats.rlds import RldsConfig
 from pipeline.generated import generated
 from pipeline.publish import push
-from pipeline.publish.card import REPORTS
 from pipeline.publish.push import Upload
 from pipeline.run.inputs import published_settings
+from pipeline.run.layout import REPORTS
 
 NAME = "tiny"
 RUN = "tiny_run"

@@ -33,7 +33,7 @@ from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.evaluation.tested import Outcome, TestedPolicy
 from pipeline.libero.tasks import STEP_LIMITS
-from pipeline.report.paper_rows import COLUMNS, csv_text, latex, markdown
+from pipeline.report.paper_rows import HEADINGS, csv_text, latex, markdown
 from pipeline.report.paper_table import table_of
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
@@ -124,16 +124,16 @@ def test_all_tasks_give_plainly_counted_rates_in_all_formats() -> None:
     policy = replace(POLICY, outcomes=[*scored(easy, 0.9), *scored(hard)])
     expected, table = counted(policy.outcomes), table_of([policy])
     assert float(expected["total"]) != float(expected["mean of seven"])
-    assert of_markdown(markdown(table))["mine"] == [expected[heading] for heading in COLUMNS]
+    assert of_markdown(markdown(table))["mine"] == [expected[heading] for heading in HEADINGS]
     line = of_csv(csv_text(table))["mine"]
-    assert {heading: line[heading.replace(" ", "_")] for heading in COLUMNS} == expected
+    assert {heading: line[heading.replace(" ", "_")] for heading in HEADINGS} == expected
     assert (line["total_tasks_run"], line["layout_tasks_run"], line["trials_per_task"]) == ("10030", "1525", "1")
     assert (line["prompt"], line["step_limits"]) == ("clean", "goal 300, long 520")
-    assert of_latex(latex(table)) == [["mine", *(expected[heading] for heading in COLUMNS)]]
+    assert of_latex(latex(table)) == [["mine", *(expected[heading] for heading in HEADINGS)]]
     assert "10,030 of 10,030" in markdown(table)
     bounds = wilson_bounds(policy.outcomes)
     assert {name: (line[f"{name}_low"], line[f"{name}_high"]) for name in bounds} == bounds
-    written = dict(zip(COLUMNS, of_markdown(markdown(table))["mine, 95 % interval"], strict=True))
+    written = dict(zip(HEADINGS, of_markdown(markdown(table))["mine, 95 % interval"], strict=True))
     assert {name: written[name] for name in bounds} == {name: " to ".join(pair) for name, pair in bounds.items()}
 
 
@@ -143,7 +143,7 @@ def test_published_rows_are_the_papers_with_the_mean_of_their_columns() -> None:
     # 69.6 in the paper; (56.4 + 31.9 + 79.5 + 88.7 + 93.3 + 75.8 + 74.2) / 7 = 71.4.
     assert cells == ["56.4", "31.9", "79.5", "88.7", "93.3", "75.8", "74.2", "69.6", "71.4"]
     line = of_csv(csv_text(table))["OpenVLA-OFT"]
-    assert [line[heading.replace(" ", "_")] for heading in COLUMNS] == cells
+    assert [line[heading.replace(" ", "_")] for heading in HEADINGS] == cells
     assert (line["published"], line["total_tasks_run"]) == ("yes", "10030")
     assert line["prompt"].startswith("not stated")
 
@@ -151,7 +151,7 @@ def test_published_rows_are_the_papers_with_the_mean_of_their_columns() -> None:
 def test_a_column_without_an_episode_is_missing_and_so_are_total_and_mean() -> None:
     tests = [test for test in benchmark.load().tasks if test.axis != "light"]
     table = table_of([replace(POLICY, outcomes=scored(tests, solved=1.0))])
-    cells = dict(zip(COLUMNS, of_markdown(markdown(table))["mine"], strict=True))
+    cells = dict(zip(HEADINGS, of_markdown(markdown(table))["mine"], strict=True))
     assert [name for name, cell in cells.items() if cell == "-"] == ["light", "total", "mean of seven"]
     line = of_csv(csv_text(table))["mine"]
     assert (line["light"], line["total"], line["mean_of_seven"], line["light_tasks_run"]) == ("", "", "", "0")
@@ -163,7 +163,7 @@ def test_a_column_without_an_episode_is_missing_and_so_are_total_and_mean() -> N
 def test_a_rate_that_leaves_out_a_part_has_a_star_and_the_part_is_named() -> None:
     tests = [test for test in benchmark.load().tasks if test.axis != "layout"]
     table = table_of([replace(POLICY, outcomes=scored(tests, solved=1.0))])
-    cells = dict(zip(COLUMNS, of_markdown(markdown(table))["mine"], strict=True))
+    cells = dict(zip(HEADINGS, of_markdown(markdown(table))["mine"], strict=True))
     assert [name for name, cell in cells.items() if cell == "100.0*"] == ["layout", "total", "mean of seven"]
     assert "mine, layout: without confounding objects (829 tasks)" in markdown(table)
     assert of_csv(csv_text(table))["mine"]["left_out_parts"] == "layout: confounding objects (829 tasks)"
@@ -179,12 +179,12 @@ def test_an_estimate_from_a_sample_of_every_part_has_a_dagger_and_its_number_of_
     tests = [*camera, *(test for test in one_of_each_part.values() if test.axis != "camera")]
     table = table_of([TestedPolicy("sampled", scored(tests), "evaluate", "clean", {}, 0)])
     (cells,) = of_latex(latex(table))
-    marked = {heading: cell.endswith(r"$^{\dagger}$") for heading, cell in zip(COLUMNS, cells[1:], strict=True)}
-    assert marked == {heading: heading != "camera" for heading in COLUMNS}
+    marked = {heading: cell.endswith(r"$^{\dagger}$") for heading, cell in zip(HEADINGS, cells[1:], strict=True)}
+    assert marked == {heading: heading != "camera" for heading in HEADINGS}
     language = sum(test.axis == "language" for test in tests)
     assert f"language {language} of 1,537" in latex(table)
     assert f"language {language} of 1,537" in markdown(table)
-    assert markdown(table).count("†") == len(COLUMNS) - 1 + 1
+    assert markdown(table).count("†") == len(HEADINGS) - 1 + 1
 
 
 def test_several_trials_of_a_task_count_as_one_task() -> None:
@@ -289,8 +289,8 @@ def test_evaluate_prints_and_writes_the_table_of_its_folder(
         rows = of_markdown(printed)
         assert rows == of_markdown((out / "paper_table.md").read_text())
         assert json.loads(printed.splitlines()[-1])["by_axis"].keys() == {axis}
-    cells = dict(zip(COLUMNS, rows["replay"], strict=True))
-    assert [name for name in COLUMNS if cells[name] != "-"] == ["robot", "language"], "of both calls"
+    cells = dict(zip(HEADINGS, rows["replay"], strict=True))
+    assert [name for name in HEADINGS if cells[name] != "-"] == ["robot", "language"], "of both calls"
     assert rows["replay, tasks run"][1:3] == ["1 of 1,550", "1 of 1,537"]
     line = of_csv((out / "paper_table.csv").read_text())["replay"]
     assert (line["total_tasks_run"], line["step_limits"], line["program"]) == ("2", "goal 2", "evaluate")
