@@ -20,7 +20,8 @@ from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.held_out import ATTEMPTS, PlannedPerturbations, sample_perturbation
-from pipeline.evaluation.policies import Server, Wanted
+from pipeline.evaluation.model_server import Server
+from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, balanced, goal_task, libero_task
 from pipeline.files import read_json, write_json

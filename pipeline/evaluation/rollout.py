@@ -18,8 +18,10 @@ from pipeline.axes.component_names import stored_names
 from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out, libero_plus, recordings
 from pipeline.evaluation.actions import checked_actions
+from pipeline.evaluation.checkpoint import Checkpoint, content_of
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
+from pipeline.evaluation.model_server import Server
+from pipeline.evaluation.policies import Policy, Wanted
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.results import (
     PER_TASK,

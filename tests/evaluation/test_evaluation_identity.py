@@ -21,9 +21,10 @@ from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out, results
+from pipeline.evaluation.checkpoint import Checkpoint
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, Progress
 from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
-from pipeline.evaluation.policies import Checkpoint, Wanted
+from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select

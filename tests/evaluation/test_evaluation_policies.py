@@ -35,9 +35,11 @@ from pipeline.__main__ import main
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import PolicyError, checked_actions
+from pipeline.evaluation.checkpoint import Checkpoint, cameras_of
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment, evaluate
-from pipeline.evaluation.policies import Checkpoint, Server, Wanted, cameras_of
+from pipeline.evaluation.model_server import Server
+from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection

@@ -18,7 +18,7 @@ from vla_eval.runners.sync_runner import SyncEpisodeRunner
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.harness import PerturbedLibero
-from pipeline.evaluation.policies import Server
+from pipeline.evaluation.model_server import Server
 from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.libero.tasks import STEP_LIMITS

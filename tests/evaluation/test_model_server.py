@@ -25,7 +25,8 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.harness import PerturbedLibero, ReplayServer
-from pipeline.evaluation.policies import Server, StateAngle, warn_of_requests
+from pipeline.evaluation.model_server import Server, warn_of_requests
+from pipeline.evaluation.policies import StateAngle
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
