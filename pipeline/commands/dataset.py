@@ -18,7 +18,7 @@ dataset = LazyGroup(
     epilog=example("dataset check configs/starter.yaml", "dataset push lerobot me/my-dataset configs/starter.yaml"),
     sections={
         "Commands": {
-            "check": Listed("dataset", "Compare all files of a run with their checksums."),
+            "check": Listed("dataset", "Compare the files of a run with their checksums."),
             "audit": Listed("dataset", "Measure how close any dataset comes to the test tasks."),
             "compare-frame": Listed("dataset", "Compare the first observation of your evaluation with ours."),
             "regenerate": Listed("dataset", "Generate one episode again, and compare it byte for byte."),
@@ -31,12 +31,13 @@ dataset = LazyGroup(
 @click.command(cls=Command, epilog=example("dataset check configs/starter.yaml"))
 @config_argument
 def check(config: Path) -> int:
-    """Compare replays, frames and datasets with their checksums, and read RLDS datasets as OpenVLA-OFT does.
+    """Compare the files of a run with their checksums, and read RLDS datasets as OpenVLA-OFT does.
 
-    The plan, the manifest and the JSON reports are only read; cards, pictures and the report are not checked. Damaged
-    files are listed, and faults that would mislead OpenVLA-OFT's training. The last line is JSON. The exit status is 1
-    if there is such a file or fault. Move a damaged file to another place, and the run generates it again. The stage
-    validate, a part of every run, compares the datasets with each other and with the plan.
+    These are replays, frames, datasets, the fine-tuning recipes and the card. The plan, the manifest and the JSON
+    reports are only read; other pictures and the report are not checked. Damaged and foreign files are listed, and
+    faults that would mislead OpenVLA-OFT's training. The last line is JSON. The exit status is 1 if there is such a
+    file or fault. Move a damaged file to another place, and the run generates it again. The stage validate, a part of
+    every run, compares the datasets with each other and with the plan.
     """
     from pipeline.clients import oft
     from pipeline.run.layout import STATISTICS

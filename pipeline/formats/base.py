@@ -323,3 +323,7 @@ class Format(ABC, Generic[Options]):
             name: name of the run's datasets.
             kept: the manifest's rows of its episodes.
         """
+
+
+AnyFormat = Format[Any]
+"""Dataset of any format."""

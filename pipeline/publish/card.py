@@ -19,7 +19,7 @@ from pipeline.catalogue import texture_sources
 from pipeline.clients.files import RECIPE
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum, read_json, schema_file
-from pipeline.formats.base import Format
+from pipeline.formats.base import AnyFormat
 from pipeline.formats.episodes import EpisodeFacts, demos_for_validation
 from pipeline.generated import generated
 from pipeline.libero.tasks import SUITES
@@ -49,8 +49,6 @@ TEMPLATES = jinja2.Environment(
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-
-AnyFormat = Format[Any]
 
 
 def write(run: Run) -> None:

@@ -31,7 +31,7 @@ from pipeline.files import (
     sync,
     write_json,
 )
-from pipeline.formats.base import DatasetRecord, Format
+from pipeline.formats.base import AnyFormat, DatasetRecord
 from pipeline.formats.episodes import EpisodeFacts, Episodes, Load, Piece
 from pipeline.identity import ALLOW, REMAKE, reject_unasked
 from pipeline.record import Basis
@@ -40,8 +40,6 @@ from pipeline.run.outcome import shuffled
 from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
 from pipeline.seeding import digest
-
-AnyFormat = Format[Any]
 
 OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]+\.json")
 """Name of the statistics that OpenVLA-OFT's loader stores next to the shards, and reuses even for a later dataset."""
@@ -185,6 +183,15 @@ def reject_unrecorded(folder: Path) -> None:
             expected=f"only the files that {record_file} lists",
             remedy=f"move it out of {folder}",
         )
+
+
+def unrecorded_files(target: AnyFormat) -> list[Path]:
+    """List the files of a finished dataset's folder that its record does not list.
+
+    Raises:
+        PipelineError: when there is no record, or it cannot be read.
+    """
+    return _unrecorded(target.folder, target.record().files.keys())
 
 
 def _unrecorded(folder: Path, recorded: Collection[str]) -> list[Path]:

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.files import Edition, edition
-from pipeline.formats.base import Format
+from pipeline.formats.base import AnyFormat
 from pipeline.planning import plan
 from pipeline.run import manifest, outcome
 from pipeline.run.episode_loader import EpisodeLoader
@@ -17,8 +17,6 @@ from pipeline.run.layout import FRAMES, MANIFEST, PLAN, REPORT, TRAJECTORIES, VA
 from pipeline.run.outcome import Outcome
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-
-AnyFormat = Format[Any]
 
 
 class Run:

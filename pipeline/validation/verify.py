@@ -1,24 +1,29 @@
 """Comparison of all stored files of a run with the checksums that were recorded when they were written."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any
 
+from pipeline import generated
 from pipeline.compute.pool import Workers
 from pipeline.errors import MAKE_AGAIN, PipelineError
-from pipeline.files import read_json
+from pipeline.files import checksum, read_json
+from pipeline.formats.base import AnyFormat
 from pipeline.formats.read_back import Written
 from pipeline.planning import plan
 from pipeline.run import manifest
-from pipeline.run.layout import COUNTS, LEAKAGE, STATISTICS
+from pipeline.run.export import unrecorded_files
+from pipeline.run.layout import COUNTS, DATASETS, LEAKAGE, STATISTICS
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE, Store
 from pipeline.tables import read_table
 
 
 def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
-    """Read every stored file of a run: trajectories, frames, the datasets and the tables.
+    """Read every stored file of a run: trajectories, frames, the datasets, the generated folders and the tables.
+
+    Files that no record lists count as damage, too: a client may read them.
 
     Returns:
         JSON-serialisable: the part of the run to the number of ``checked`` files, and to the ``damaged`` or missing
@@ -30,22 +35,56 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
         there = store.names()
         damages = [*workers(partial(_damaged, store), there, name), *_gone(store, there)]
         results[name] = _result(damages)
-    for dataset in run.recorded_formats:
+    records: Mapping[str, str] = read_json(run.path(DATASETS)) if run.path(DATASETS).exists() else {}
+    for dataset in (*run.formats, *_failure_formats(run, records)):
         name = dataset.folder.relative_to(run.folder).as_posix()
-        try:
-            files = dataset.written()
-        except PipelineError as error:
-            results[name] = {"checked": 0, "damaged": [str(error)]}
-            continue
-        damages = []
-        for faults in workers(Written.faults, files, dataset.title):
-            damages.append([f"{fault.what}: {fault.expected}" for fault in faults])
-        results[name] = _result(damages)
+        results[name] = _verify_dataset(dataset, records.get(_record_of(dataset, run)), workers)
+    for name in generated.FOLDERS:
+        if run.path(name).exists():
+            results[name] = _result([_unreadable(partial(generated.unchanged, run.path(name)))])
     results["tables"] = _result(_unreadable(read) for read in _readers(run))
     if not any(result["damaged"] for result in results.values()):
         # A file and the table that lists it may both be gone; the plan still needs the file.
         results["episodes"] = _result([_unreadable(lambda: run.outcome)])
     return results
+
+
+def _record_of(dataset: AnyFormat, run: Run) -> str:
+    """Return the path of a dataset's record below the folder of the run."""
+    return dataset.record_file.relative_to(run.folder).as_posix()
+
+
+def _failure_formats(run: Run, records: Collection[str]) -> list[AnyFormat]:
+    """List the datasets of failures that were written, or of which something is left. A run without failures has none.
+
+    Args:
+        records: paths of the records that the exports listed.
+    """
+    written = []
+    for dataset in run.failure_formats:
+        if dataset.folder.exists() or dataset.record_file.exists() or _record_of(dataset, run) in records:
+            written.append(dataset)
+    return written
+
+
+def _verify_dataset(dataset: AnyFormat, record_sha256: str | None, workers: Workers) -> dict[str, Any]:
+    """Compare the files of a dataset with its record.
+
+    Args:
+        record_sha256: SHA-256 of the record when the export ended; `None` if it is not known.
+    """
+    try:
+        files = dataset.written()
+        unrecorded = unrecorded_files(dataset)
+    except PipelineError as error:
+        return {"checked": 0, "damaged": [str(error)]}
+    damages = []
+    for faults in workers(Written.faults, files, dataset.title):
+        damages.append([f"{fault.what}: {fault.expected}" for fault in faults])
+    damages.append([f"{file}: no record of an export lists it; move it to another place" for file in unrecorded])
+    if record_sha256 is not None and checksum(dataset.record_file) != record_sha256:
+        damages.append([f"{dataset.record_file}: not the record that the export wrote; move it to another place"])
+    return _result(damages)
 
 
 def _gone(store: Store, there: Sequence[str]) -> list[list[str]]:

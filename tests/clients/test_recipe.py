@@ -209,6 +209,16 @@ def test_the_evaluation_of_each_trained_policy_is_understood_by_both_programs(tm
     assert f"--args.chunk_size {chunk}" in evaluated["openvla_oft"]["server"]
 
 
+@pytest.mark.parametrize("action", ["delta", "absolute"])
+def test_policies_are_evaluated_with_the_actions_that_they_are_trained_on(action: str, tmp_path: Path) -> None:
+    """The column of goals is lerobot's alone; RLDS has deltas."""
+    evaluated = evaluated_here(tiny_recipe(tmp_path, export_config(lerobot={"name": NAME, "action": action})))
+    executed = {}
+    for name, commands in evaluated.items():
+        executed[name] = parse(shlex.split(commands["command"])[3:]).params["actions"] or "delta"
+    assert executed == {"openvla_oft": "delta", **dict.fromkeys(CLIENTS_V30["libero"], action)}
+
+
 def test_policies_of_own_tasks_are_evaluated_on_these(tmp_path: Path) -> None:
     """By default, ``evaluate`` tests LIBERO's four suites, and it has no step limit for others."""
     export = export_config(lerobot_openpi={"name": NAME, "validation": 0.1})

@@ -31,6 +31,7 @@ from pipeline.types import Episode, Scene, Trajectory, Verdict
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 from pipeline.validation.validate import EpisodesJob
+from pipeline.validation.verify import verify
 
 STAGES = ("inputs", "render", "exports", "manifest", "validate")
 
@@ -136,6 +137,20 @@ def of_failure(episode_id: str) -> Episode:
     """Return a synthetic episode with the outcome of a failure."""
     source = episode(episode_id)
     return replace(source, provenance={**source.provenance, "success": False, "reason": "goal_not_reached"})
+
+
+def test_check_misses_a_lost_set_of_failures(asked: Path, tmp_path: Path) -> None:
+    shutil.copytree(asked.parents[1], tmp_path, dirs_exist_ok=True)
+    with chdir(tmp_path):
+        run = Run(load(Path("configs/tiny.yaml")))
+        assert not any(result["damaged"] for result in verify(run, loop).values())
+        (run.folder / "failures" / "lerobot.json").unlink()
+        shutil.rmtree(run.folder / "failures" / "rlds")
+        (run.folder / "failures" / "rlds.json").unlink()
+        results = verify(run, loop)
+    lost = {name: result["damaged"] for name, result in results.items() if result["damaged"]}
+    assert lost.keys() == {"failures/lerobot", "failures/rlds"}
+    assert all("there is no finished dataset" in told for (told,) in lost.values())
 
 
 def test_a_damaged_set_of_failures_leaves_the_record_of_the_others(asked: Path, tmp_path: Path) -> None:

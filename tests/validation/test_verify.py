@@ -49,6 +49,28 @@ def test_check_finds_a_deleted_file(part: str, finished: Path, tmp_path: Path) -
     assert [what for result in without_table.values() for what in result["damaged"]]
 
 
+@pytest.mark.parametrize(
+    ("path", "part", "told"),
+    [
+        ("finetune/finetune.yaml", "finetune", "1 files differ from the generated ones: finetune.yaml (changed)"),
+        ("finetune/run_openvla_oft.py", "finetune", "run_openvla_oft.py (changed)"),
+        ("card/rlds/README.md", "card", "rlds/README.md (changed)"),
+        ("lerobot/tiny/data/chunk-000/episode_000007.parquet", "lerobot", "no record of an export lists it"),
+        ("lerobot.json", "lerobot", "not the record that the export wrote"),
+    ],
+)
+def test_check_finds_edits_and_additions(path: str, part: str, told: str, finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    with (data / path).open("a") as file:
+        file.write("\n")
+    with chdir(tmp_path):
+        results = verify(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
+    (found,) = results.pop(part)["damaged"]
+    assert told in found
+    assert not any(result["damaged"] for result in results.values())
+
+
 @pytest.mark.parametrize("name", ["plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json"])
 def test_check_finds_a_deleted_table(name: str, finished: Path, tmp_path: Path) -> None:
     data = tmp_path / "data" / "tiny"

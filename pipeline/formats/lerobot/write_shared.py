@@ -8,7 +8,6 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +50,8 @@ def load_each(piece: Piece, load: Load, layout: Layout) -> Iterator[tuple[int, i
     """Load and check each episode of a piece.
 
     Yields:
-        Number of the episode, number of preceding steps, the episode, and its numeric columns.
+        Number of the episode, number of preceding steps, the episode with LIBERO's gripper, and its numeric columns
+        with the gripper of the convention.
 
     Raises:
         PipelineError: when an episode breaks the schema.
@@ -60,12 +60,6 @@ def load_each(piece: Piece, load: Load, layout: Layout) -> Iterator[tuple[int, i
     for index, episode_id in enumerate(piece.ids, piece.first_episode):
         episode = load(episode_id)
         check(episode, layout.content)
-        if layout.convention.open_is_one:
-            episode = replace(
-                episode,
-                action=open_is_one(episode.action),
-                action_absolute=open_is_one(episode.action_absolute),
-            )
         yield index, first_step, episode, _numbers(episode, index, first_step, piece, layout)
         first_step += len(episode)
 
@@ -122,7 +116,11 @@ def append_depth(episode: Episode, view: str, video: DepthVideo) -> Counts:
 
 def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, layout: Layout) -> Numbers:
     steps, task = np.arange(len(episode)), piece.tasks[episode.instruction]
-    numbers: dict[str, NDArray[Any]] = {key: getattr(episode, name) for name, key in layout.motion_keys.items()}
+    numbers: dict[str, NDArray[Any]] = {}
+    for name, key in layout.motion_keys.items():
+        values = getattr(episode, name)
+        has_gripper = name in ("action", "action_absolute")
+        numbers[key] = open_is_one(values) if has_gripper and layout.convention.open_is_one else values
     if episode.object_poses is not None:
         numbers[OBJECT_POSES] = episode.object_poses.reshape(len(steps), -1)
     for view, geometry in episode.geometry.items():
