@@ -40,8 +40,10 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
         name = dataset.folder.relative_to(run.folder).as_posix()
         results[name] = _verify_dataset(dataset, records.get(_record_of(dataset, run)), workers)
     for name in generated.FOLDERS:
-        if run.path(name).exists():
-            results[name] = _result([_unreadable(partial(generated.unchanged, run.path(name)))])
+        folder = run.path(name)
+        if folder.exists():
+            checked = sum(path.is_file() for path in folder.rglob("*"))
+            results[name] = {"checked": checked, "damaged": _unreadable(partial(generated.unchanged, folder))}
     results["tables"] = _result(_unreadable(read) for read in _readers(run))
     if not any(result["damaged"] for result in results.values()):
         # A file and the table that lists it may both be gone; the plan still needs the file.
