@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
 
 from numpy.typing import NDArray
@@ -89,7 +90,7 @@ def groups_of(plot: Plot) -> list[str]:
     if isinstance(plot, Bars):
         return [plot.group]
     if isinstance(plot, Strips):
-        return list(dict.fromkeys(name for groups in plot.rows.values() for name in groups))
+        return list(dict.fromkeys(chain.from_iterable(plot.rows.values())))
     return list(plot.groups)
 
 

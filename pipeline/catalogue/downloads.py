@@ -44,14 +44,13 @@ def fetched(path: Path, sha256: str, command: Sequence[str], content: str, remed
             reason = printed[-1] if printed else str(error)
             raise PipelineError(f"{content} could not be downloaded ({reason})", where=path, remedy=remedy) from error
         downloaded = Path(scratch) / path.name
-        downloaded_sha256 = checksum(downloaded)
-        if downloaded_sha256 != sha256:
+        try:
+            check(downloaded, sha256, content)
+        except PipelineError as error:
+            # The file is deleted, so name the place that it was meant for.
             raise PipelineError(
-                f"{content} was downloaded with another SHA-256, {downloaded_sha256}",
-                where=path,
-                expected=sha256,
-                remedy=remedy,
-            )
+                f"the download is wrong: {error.what}", where=path, expected=error.expected, remedy=remedy
+            ) from error
         os.replace(downloaded, path)
     return path
 

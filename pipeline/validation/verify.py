@@ -1,6 +1,7 @@
 """Comparison of all stored files of a run with the checksums that were recorded when they were written."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -35,7 +36,10 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
         there = store.names()
         damages = [*workers(partial(_damaged, store), there, name), *_gone(store, there)]
         results[name] = _result(damages)
-    records: Mapping[str, str] = read_json(run.path(DATASETS)) if run.path(DATASETS).exists() else {}
+    records: Mapping[str, str] = {}
+    if run.path(DATASETS).exists():
+        with suppress(PipelineError):  # Reading the tables reports the fault.
+            records = read_json(run.path(DATASETS))
     for dataset in (*run.formats, *_failure_formats(run, records)):
         name = dataset.folder.relative_to(run.folder).as_posix()
         results[name] = _verify_dataset(dataset, records.get(_record_of(dataset, run)), workers)
@@ -85,7 +89,8 @@ def _verify_dataset(dataset: AnyFormat, record_sha256: str | None, workers: Work
         damages.append([f"{fault.what}: {fault.expected}" for fault in faults])
     damages.append([f"{file}: no record of an export lists it; move it to another place" for file in unrecorded])
     if record_sha256 is not None and checksum(dataset.record_file) != record_sha256:
-        damages.append([f"{dataset.record_file}: not the record that the export wrote; move it to another place"])
+        remedy = f"restore it, or move it and {dataset.folder} to another place"
+        damages.append([f"{dataset.record_file}: not the record that the export wrote; {remedy}"])
     return _result(damages)
 
 
@@ -109,6 +114,8 @@ def _readers(run: Run) -> list[Callable[[], object]]:
         partial(manifest.read, run.manifest_file),
     ]
     names = [COUNTS, LEAKAGE, *([STATISTICS] if "rlds" in run.config.export.formats else [])]
+    if run.path(DATASETS).exists():
+        names.append(DATASETS)
     return [*readers, *(partial(read_json, run.path(name)) for name in names)]
 
 

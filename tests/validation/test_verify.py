@@ -81,6 +81,17 @@ def test_check_finds_a_deleted_table(name: str, finished: Path, tmp_path: Path) 
     assert any(name in what for what in results["tables"]["damaged"])
 
 
+def test_check_finds_a_damaged_list_of_records(finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    (data / "datasets.json").write_text("{")
+    with chdir(tmp_path):
+        results = verify(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
+    (told,) = results.pop("tables")["damaged"]
+    assert "datasets.json" in told
+    assert not any(result["damaged"] for result in results.values())
+
+
 def test_a_changed_dataset_is_not_read_any_further(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
