@@ -19,8 +19,8 @@ class PolicyResults:
         arm, seed: arm and seed of its training.
         settings: settings of the experiment, and the tasks.
         made: hashes of data, sentences and policy; axes of the episodes, numbers of frames and of different
-            demonstrations; losses; packages of the training (``trained_with``, since 2026-11-29) and of the evaluation;
-            times of the steps.
+            demonstrations; losses; ``trained_with`` (packages and processors of the training, since 2026-11-29, and its
+            precision, since 2026-11-30); packages of the evaluation; times of the steps.
         rows: episodes of test tasks.
         reading: rows of ``evaluation.run_instructed_episodes``.
         black: ``task``, ``state`` and ``success`` from LIBERO's own states with both views black.

@@ -535,6 +535,8 @@ def test_from_demonstrations_to_the_results(
     (dataset,) = Path("data/effect/datasets").glob("more_*.npz")
     assert (found.made["demonstrations"], found.made["frames"]) == (1, len(np.load(dataset)["action"]))
     assert found.made["trained_with"]["packages"] == found.made["packages"]
+    has_avx512 = "avx512vl" in Path("/proc/cpuinfo").read_text()
+    assert found.made["trained_with"]["precision"] == ("bfloat16" if has_avx512 else "float32")
     (clean,), (more,) = (list(Path("data/effect/datasets").glob(f"{arm}_*/")) for arm in ("clean", "more"))
     files = {file.relative_to(clean) for file in clean.glob("*/**/*.npz")}
     assert {file.parts[0] for file in files} == {"trajectories", "frames"}
