@@ -32,7 +32,7 @@ def _of_some(share: float) -> float:
     return share
 
 
-Share = Annotated[float, Field(ge=0.0, le=0.5), AfterValidator(_of_some)]
+ValidationShare = Annotated[float, Field(ge=0.0, le=0.5), AfterValidator(_of_some)]
 
 Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$", max_length=LONGEST_NAME)]
 """Name of a dataset; ``Config`` replaces an empty name by ``libero_`` and the name of the run."""
@@ -53,7 +53,7 @@ class FormatOptions(Frozen):
 
     name: Name = ""
     if TYPE_CHECKING:
-        validation: Share = 0.0
+        validation: ValidationShare = 0.0
 
     def reject_name(self) -> None:
         """Reject a name under which a client would misread the dataset.

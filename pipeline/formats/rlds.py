@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import pyarrow as pa
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, STANDARD, Content
-from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
+from pipeline.formats.base import Format, FormatOptions, Name, Row, StepSizes, ValidationShare
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, dataset_of, shard_path
@@ -32,7 +32,7 @@ class RldsConfig(FormatOptions):
 
     name: Name = ""
     shards: Count | None = None
-    validation: Share = 0.0
+    validation: ValidationShare = 0.0
 
     def reject_name(self) -> None:
         # OpenVLA-OFT decides by the name whether it reads a set with LIBERO's constants and cameras.

@@ -11,7 +11,7 @@ from pipeline.evaluation.results import Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
 from pipeline.report import figures, pages
 from pipeline.report.evaluation_findings import FAILURES, findings
-from pipeline.report.figures import Panel, Share
+from pipeline.report.figures import Panel, PlottedShare
 
 TITLES = {
     "libero_plus": "LIBERO-Plus's test tasks",
@@ -121,10 +121,10 @@ def _section(source: str, found: Mapping[str, Any], colours: Mapping[str, str]) 
         groups[grouping] = sorted(set().union(*(summary[grouping] for summary in results.values())))
 
     def plot(grouping: str, title: str) -> Panel:
-        rows: dict[str, list[Share]] = {name: [] for name in groups[grouping]}
+        rows: dict[str, list[PlottedShare]] = {name: [] for name in groups[grouping]}
         for policy, summary in results.items():
             for name, group in summary[grouping].items():
-                rows[name].append(Share(group["rate"], group["low"], group["high"], colours[policy]))
+                rows[name].append(PlottedShare(group["rate"], group["low"], group["high"], colours[policy]))
         return figures.intervals(title, rows, "success rate")
 
     # A grouping with a single group repeats the whole, which the top of the page shows.

@@ -183,7 +183,7 @@ def bars(title: str, counts: Mapping[str, int], group: str, label: str) -> Panel
     return panel(title, plot, 0.8 + 0.2 * len(ordered))
 
 
-class Share(NamedTuple):
+class PlottedShare(NamedTuple):
     """A share in [0, 1] with its interval, and its colour in plots."""
 
     share: float
@@ -192,7 +192,7 @@ class Share(NamedTuple):
     colour: str
 
 
-def intervals(title: str, rows: Mapping[str, Sequence[Share]], label: str) -> Panel:
+def intervals(title: str, rows: Mapping[str, Sequence[PlottedShare]], label: str) -> Panel:
     """Plot a line for each row, with its shares and their intervals below each other."""
     most = max(map(len, rows.values()))
 

@@ -52,7 +52,7 @@ def spread(values: ArrayLike) -> Spread:
     return Spread(measured.size, *(round(float(q), 4) for q in np.percentile(measured, [10, 50, 90])))
 
 
-class Share(NamedTuple):
+class MeasuredShare(NamedTuple):
     """The share of ``number`` items, such as scenes, that have a property."""
 
     number: int
@@ -67,8 +67,8 @@ class Measure(NamedTuple):
 
     axis: str
     what: str
-    tested: Spread | Share | None
-    ours: Spread | Share | None
+    tested: Spread | MeasuredShare | None
+    ours: Spread | MeasuredShare | None
 
 
 def measure(run: Run, test: TestSet) -> list[Measure]:
@@ -106,12 +106,12 @@ def clean_measures(look: Look) -> dict[str, float]:
     }
 
 
-def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
+def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | MeasuredShare]:
     """Summarize the values of each name: truth values as a share, numbers as percentiles."""
-    summaries: dict[str, Spread | Share] = {}
+    summaries: dict[str, Spread | MeasuredShare] = {}
     for name, values in grouped(pairs).items():
         if isinstance(values[0], bool):
-            summaries[name] = Share(len(values), round(float(np.mean(values)), 4))
+            summaries[name] = MeasuredShare(len(values), round(float(np.mean(values)), 4))
         else:
             summaries[name] = spread(values)
     return summaries

@@ -229,8 +229,8 @@ def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: 
     assert words.tested is not None
     assert words.tested.number == 1537
     assert measures["layout", "objects on the camera's side"].ours is None
-    assert measures["layout", "scenes with 5 added objects"].tested == seen.Share(829, round(207 / 829, 4))
-    assert measures["layout", "scenes with 2 added objects and a repeated model"].tested == seen.Share(
+    assert measures["layout", "scenes with 5 added objects"].tested == seen.MeasuredShare(829, round(207 / 829, 4))
+    assert measures["layout", "scenes with 2 added objects and a repeated model"].tested == seen.MeasuredShare(
         151, round(9 / 151, 4)
     )
     for suite in SUITES[:4]:

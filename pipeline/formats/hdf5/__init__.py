@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import pyarrow as pa
 
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content
-from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
+from pipeline.formats.base import Format, FormatOptions, Name, Row, StepSizes, ValidationShare
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.hdf5 import layout
 from pipeline.formats.read_back import Copy, Fault
@@ -24,7 +24,7 @@ class Hdf5Config(FormatOptions):
     """
 
     name: Name = ""
-    validation: Share = 0.0
+    validation: ValidationShare = 0.0
 
 
 class Hdf5(Format[Hdf5Config]):

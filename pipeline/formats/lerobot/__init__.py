@@ -12,7 +12,7 @@ from packaging.version import Version
 from pydantic import Field, field_validator
 
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
-from pipeline.formats.base import Format, FormatOptions, Name, Row, Share, StepSizes
+from pipeline.formats.base import Format, FormatOptions, Name, Row, StepSizes, ValidationShare
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, number_pieces, split
 from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, VIEW_AS_VIDEO_KB, Action, Depth, Layout
 from pipeline.formats.read_back import Copy, Fault
@@ -58,7 +58,7 @@ class LeRobotConfig(FormatOptions):
     # The identity of finished datasets depends on their options, which contain the field under its first name.
     shards: Count | None = Field(default=None, serialization_alias="parts")
     frames: Literal["video", "images"] = "video"
-    validation: Share = 0.0
+    validation: ValidationShare = 0.0
     # Excluded at their defaults, as ``lerobot_v21``.
     action: Action = Field(default="delta", exclude_if=lambda action: action == "delta")
     language: bool = Field(default=False, exclude_if=lambda language: not language)
@@ -282,7 +282,7 @@ class LeRobotV21Config(FormatOptions):
 
     name: Name = ""
     convention: Literal["ipec", "openpi"]
-    validation: Share = 0.0
+    validation: ValidationShare = 0.0
 
 
 class LeRobotOpenpiConfig(LeRobotV21Config):
