@@ -40,7 +40,8 @@ def describe(run: Run) -> Iterator[str | Table]:
     views = config.render.content.views
     rejected = outcome.rejections(rows, frames, views)
     judged = selection.select(rows, verdicts, rejected)
-    yield _counts(config, rows, judged, frames)
+    if rows or config.plan.episodes:
+        yield _counts(config, rows, judged, frames)
     steps = dict(_steps(run, rows, verdicts, frames, rejected))
     if steps:
         yield "stages that would run:"
@@ -82,11 +83,11 @@ def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verd
 def _counts(
     config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
 ) -> Table:
-    table = Table("axis", title="episodes")
+    table = Table("axis", title="episodes" if rows else "episodes, without the clean twins, which the plan adds")
     for head in ("wanted", "planned", "reach their goal", "rendered"):
         table.add_column(head, justify="right", no_wrap=True)
     views, every = config.render.content.views, []
-    for axis in ("clean", *config.plan.episodes):
+    for axis in (*(["clean"] if rows else []), *config.plan.episodes):
         of_axis = [row for row in rows if row.axis == axis]
         kept = [row for row in of_axis if judged[row.episode_id].kept]
         planned = sum(row.wanted for row in of_axis)

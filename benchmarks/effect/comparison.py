@@ -29,6 +29,20 @@ SHOWN = "axes"
 JOINED_WITH = {"starts": "no_state", "goals_many": "goals", "axes_relative": "axes"}
 """Further experiment to a second one whose arms join its table: both share policies, tests and demonstrations."""
 
+SUMMARIZED = {
+    "`released`": ("axes", "released"),
+    "`all`": ("axes", "all"),
+    "`ours`": ("no_state", "ours"),
+    "`robots`": ("starts", "robots"),
+    "`poses`": ("starts", "poses"),
+    "`all`, four scenes": ("object", "all"),
+    "the same, twice the steps": ("object_long", "all"),
+}
+"""Column of the summary to the further experiment and the arm that it compares with clean data."""
+
+BEYOND_CHANCE = 0.05
+"""Holm's p-value below which the summary shows a difference in bold type."""
+
 LINES = {
     "clean": "LIBERO's own",
     "robot": "robot",
@@ -307,6 +321,27 @@ def _difference_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
     return [["tests", *pairs], *([line, *texts.values()] for line, texts in cells.items())]
 
 
+def summary() -> str:
+    """Return a table of the differences between arms of all further experiments and clean data."""
+    seeds, perturbed = ["*seeds*"], ["*perturbed episodes in each scene*"]
+    cells: dict[str, dict[str, str]] = defaultdict(dict)
+    for column, (experiment, arm) in SUMMARIZED.items():
+        clean = [policy for policy in _of_further(experiment) if policy.arm == "clean"]
+        policies = [policy for policy in _of_further(experiment) if policy.arm == arm]
+        seeds.append(str(len({policy.seed for policy in policies} & {policy.seed for policy in clean})))
+        episodes = policies[0].made["episodes_by_axis"]
+        scenes = {row["scene"] for row in _readings(policies, arm)}
+        perturbed.append(str((sum(episodes.values()) - episodes["clean"]) // len(scenes)))
+        for row in differences([*clean, *policies]):
+            points = f"{100 * row['value']:+.0f}"
+            cells[row["line"]][column] = f"**{points}**" if row["holm"] < BEYOND_CHANCE else points
+    rows = [["tests", *SUMMARIZED], seeds, perturbed]
+    for line in LINES:
+        if line in cells:
+            rows.append([LINES[line], *(cells[line].get(column, "") for column in SUMMARIZED)])
+    return _table(rows)
+
+
 def _p_value(p_value: float) -> str:
     """Return the text of a p-value; of very small ones only the order, as resampling does not compute them."""
     if p_value < 0.01:
@@ -402,7 +437,7 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
 
 
 def publish(folder: Path, docs: Path = DOCS, log: Path = LOG) -> str:
-    """Write the tables and the plot of ``SHOWN`` into docs/effect.md, and those of all others into benchmarks/LOG.md.
+    """Write the summary, and tables and plot of ``SHOWN``, into docs/effect.md, and all others into benchmarks/LOG.md.
 
     Args:
         folder: results of the first experiment.
@@ -413,15 +448,21 @@ def publish(folder: Path, docs: Path = DOCS, log: Path = LOG) -> str:
     shown = read(FURTHER / SHOWN)
     text = markdown(shown) + "\n![success by tests and arm](effect.svg)\n"
     plot(shown, docs / "effect.svg")
+    _write(docs / "effect.md", "summary", summary())
     _write(docs / "effect.md", "table", text)
     _write(log, "experiment", markdown(read(folder)))
     for further in sorted(FURTHER.iterdir()):
         if further.name != SHOWN:
-            results = read(further)
-            if further.name in JOINED_WITH:
-                results = join(read(FURTHER / JOINED_WITH[further.name]), results, further)
-            _write(log, further.name, markdown(results))
+            _write(log, further.name, markdown(_of_further(further.name)))
     return text
+
+
+def _of_further(name: str) -> list[PolicyResults]:
+    """Read the policies of a further experiment, after those of the experiment that it is joined with."""
+    results = read(FURTHER / name)
+    if name not in JOINED_WITH:
+        return results
+    return join(read(FURTHER / JOINED_WITH[name]), results, FURTHER / name)
 
 
 def _write(page: Path, name: str, text: str) -> None:

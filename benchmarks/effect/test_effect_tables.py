@@ -8,6 +8,7 @@ from typing import Any
 
 import comparison
 import numpy as np
+import pandas as pd
 import pytest
 import results
 from conftest import REPOSITORY
@@ -213,6 +214,41 @@ def test_the_page_shows_what_the_committed_rows_say(tmp_path: Path) -> None:
     comparison.publish(EFFECT / "results", tmp_path, tmp_path / log.name)
     for page in (docs / "effect.md", docs / "effect.svg", log):
         assert (tmp_path / page.name).read_bytes() == page.read_bytes(), "python benchmarks/effect table"
+
+
+def test_the_summary_has_the_differences_of_the_committed_rows() -> None:
+    """28 cells: four kinds of tests, in seven columns; computed from the files alone."""
+    folders = {"`all`": "axes", "`released`": "axes", "`ours`": "no_state", "`all`, four scenes": "object"}
+    folders |= {"`robots`": "starts", "`poses`": "starts", "the same, twice the steps": "object_long"}
+    arms = {"`released`": "released", "`ours`": "ours", "`robots`": "robots", "`poses`": "poses"}
+    head, _, seeds, perturbed, *lines = [line.strip("| ").split(" | ") for line in comparison.summary().splitlines()]
+
+    def successes(folder: str, arm: str) -> pd.DataFrame:
+        tables: list[pd.DataFrame] = []
+        for file in (EFFECT / "further" / "results" / folder).glob(f"{arm}_seed*.json"):
+            content = json.loads(file.read_text())
+            table = pd.DataFrame(content["rows"], columns=content["columns"])
+            tables.append(table.assign(trained_with_seed=content["seed"]))
+        return pd.concat(tables)
+
+    compared = 0
+    for place, column in enumerate(head[1:], 1):
+        arm, folder = arms.get(column, "all"), folders[column]
+        ours, clean = successes(folder, arm), successes("no_state" if folder == "starts" else folder, "clean")
+        common = set(ours["trained_with_seed"]) & set(clean["trained_with_seed"])
+        assert int(seeds[place]) == len(common)
+        for line in lines:
+            axis = {"LIBERO's own": "clean"}.get(line[0], line[0])
+            if axis in ("clean", "robot", "language", "pose"):
+                rates: list[float] = []
+                for table in (clean, ours):
+                    chosen = table[(table["axis"] == axis) & table["trained_with_seed"].isin(common)]
+                    rates.append(chosen["success"].mean())
+                points = float(line[place].strip("*"))
+                assert points == pytest.approx(100 * (rates[1] - rates[0]), abs=0.501), (line[0], column)
+                compared += 1
+    assert compared == 28
+    assert perturbed[1:] == ["212", "212", "128", "128", "128", "32", "32"]
 
 
 def test_the_plot_of_the_page_is_the_same_each_time(tmp_path: Path) -> None:
