@@ -51,7 +51,9 @@ class DemosConfig(Frozen):
 
     source: Literal["starter", "hdf5"] = "starter"
     root: Place | None = None
-    tasks: tuple[str, ...] = ("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*")
+    tasks: Annotated[tuple[str, ...], Field(min_length=1)] = (
+        *("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*"),
+    )
     per_task: Count | None = None
 
     @model_validator(mode="before")
@@ -116,13 +118,18 @@ class PlanConfig(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _default_ranges(cls, raw: Any) -> Any:
-        axes = raw.get("axes", {}) if isinstance(raw, Mapping) else None
-        if not isinstance(axes, Mapping) or not isinstance(raw.get("episodes"), Mapping):
+        if not isinstance(raw, Mapping) or not isinstance(raw.get("episodes"), Mapping):
             return raw
-        named: set[str] = set()
+        # YAML reads a section whose options are all comments as None.
+        axes = {} if raw.get("axes") is None else raw["axes"]
+        if not isinstance(axes, Mapping):
+            return raw
+        with_defaults = dict(axes)
         for name in raw["episodes"]:
-            named.update(axis for axis in str(name).split("+") if axis in AXES)
-        return {**raw, "axes": {axis: {} for axis in named} | dict(axes)}
+            for axis in str(name).split("+"):
+                if axis in AXES and with_defaults.get(axis) is None:
+                    with_defaults[axis] = {}
+        return {**raw, "axes": with_defaults}
 
     @field_validator("episodes")
     @classmethod
@@ -163,7 +170,8 @@ class ReplayConfig(Frozen):
 
     Attributes:
         mode: ``open_loop`` sends the recorded actions unchanged, as the paper does. ``tracked`` follows the hand's path
-            of a successful replay by feedback. ``auto``, the default, tracks only if the open-loop replay fails.
+            of a successful replay by feedback. ``auto``, the default, tracks if the open-loop replay fails, and always
+            after a push and from a start of LIBERO's reset.
         noops: ``drop``, the default, skips every no-op, as OpenVLA does. ``trim_ends`` skips only the no-ops before the
             first and after the last real action. ``keep`` skips none.
         settle_steps: Control steps without action, with an open gripper, before the first frame; 10 by default. Every
@@ -392,12 +400,14 @@ class Config(Frozen):
 
     @model_validator(mode="after")
     def _export_selects_from_the_run(self) -> Config:
-        components = {CLEAN}
-        for axis in self.plan.axes.configured():
-            components.update(components_of(axis))
-        values_of_run = {
+        components, levels = {CLEAN}, {0}
+        for name, axis in self.plan.axes.configured().items():
+            components.update(getattr(axis, "components", components_of(name)))
+            levels.update(axis.levels)
+        values_of_run: dict[str, set[Any]] = {
             "axis": {CLEAN, *self.plan.episodes},
             "component": components,
+            "level": levels,
             "suite": {task.suite for task in select_tasks(self.demos.tasks)},
         }
         for field, values in values_of_run.items():

@@ -81,7 +81,12 @@ DISTRIBUTION = "perturbed-libero"
 """Name of this project among installed packages; on PyPI, ``pipeline`` is another project."""
 
 REMAKE = "REMAKE"
-"""Environment variable that allows stages to generate finished files again: ``REMAKE=1`` before the command."""
+"""Environment variable that permits a command, as ``REMAKE=1`` before it, to generate finished work again.
+
+It also permits to delete finished work that a changed plan no longer needs, to replace edited files of a dataset, and
+to replace demonstrations of an earlier ``demos expand``. Edited folders ``card`` and ``finetune`` are kept under
+another name.
+"""
 
 VERSIONS = {
     "pipeline": "this project",
@@ -93,6 +98,11 @@ VERSIONS = {
     "opencv-python-headless": "noise and JPEG encoding",
 }
 """Packages with a column in the manifest, and their purposes."""
+
+
+def version_column(package: str) -> str:
+    """Return the name of the manifest's column for the version of a package."""
+    return f"{package.replace('-', '_')}_version"
 
 
 @cache

@@ -25,7 +25,11 @@ def perform_stage(script: str) -> None:
     purposes = [f"Stage {name}: {STAGES[name].work.__doc__}" for name in names]
     parser = argparse.ArgumentParser(description=" ".join(purposes))
     parser.add_argument("config", type=Path, help="configuration file, such as configs/starter.yaml")
-    parser.add_argument("--remake", action="store_true", help=f"allow generating finished work again, as {REMAKE}=1")
+    remake = (
+        "allow generating finished work again, deleting finished work that is no longer needed, and replacing edited "
+        f"files of datasets, as {REMAKE}=1"
+    )
+    parser.add_argument("--remake", action="store_true", help=remake)
     arguments = parser.parse_args()
     if arguments.remake:
         os.environ[REMAKE] = "1"

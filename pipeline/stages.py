@@ -124,11 +124,11 @@ def make_plan(run: Run) -> None:
             file=sys.stderr,
         )
     plan.write(rows, run.plan_file)
-    trajectories = len({row.trajectory_id for row in rows})
     wanted = [row for row in rows if row.wanted]
-    sequences = len({row.trajectory_id for row in wanted})
-    print(f"planned {len(wanted)} episodes from {trajectories} trajectories")
-    print(f"the episodes have at most {sequences} distinct action sequences, as many as they have trajectories")
+    trajectories = {row.trajectory_id for row in wanted}
+    reserves = {row.trajectory_id for row in rows} - trajectories
+    print(f"planned {len(wanted)} episodes from {len(trajectories)} trajectories, and {len(reserves)} in reserve")
+    print(f"the episodes have at most {len(trajectories)} distinct action sequences, one for each trajectory")
 
 
 def check_leakage(run: Run) -> None:

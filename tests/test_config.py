@@ -16,6 +16,8 @@ from conftest import REPOSITORY
 from pydantic import BaseModel, ValidationError
 
 from pipeline.axes.background import BackgroundAxis
+from pipeline.axes.base import LEVELS
+from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis
 from pipeline.catalogue.sources import Folder
 from pipeline.commands.develop import schemas
@@ -120,10 +122,11 @@ def test_every_field_is_described(model: type[BaseModel]) -> None:
         ({"source": "starter", "root": "/tmp"}, ("demos",), "source: hdf5 and root require each other"),
         ({"source": "hdf5"}, ("demos",), "source: hdf5 and root require each other"),
         ({"tasks": ["libero_goal/put_the_bowl_on_the_plat"]}, ("demos",), "libero_goal/put_the_bowl_on_the_plate"),
+        ([], ("demos", "tasks"), "demos.tasks: expected at least 1 value"),
         ({"tasks": ["libero_90/*"]}, ("demos",), "plan.axes.language: 90 tasks have no rewrites"),
         ({"rlds": None, "lerobot": None}, ("export",), "no format is left, expected one of rlds, lerobot"),
         ({"axis": ["wind"]}, ("export", "where"), "export.where.axis: the run has no 'wind', expected values ["),
-        ({"component": ["target", "sky"]}, ("export", "where"), "export.where.component: the run has no 'sky'"),
+        ({"component": ["scene", "sky"]}, ("export", "where"), "export.where.component: the run has no 'sky'"),
         ({"level": [6]}, ("export", "where"), "export.where.level.0: expected at most 5, got 6"),
         ({"level": []}, ("export", "where"), "export.where.level"),
         ({"suite": ["libero_90"]}, ("export", "where"), "export.where.suite: the run has no 'libero_90'"),
@@ -167,6 +170,38 @@ def test_faults_name_file_and_field(tmp_path: Path, value: Any, keys: tuple[str,
         load(file)
     assert message in str(caught.value)
     assert str(file) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        ({"level": [1, 5]}, "export.where.level: the run has no 5, expected values [0, 1, 2]"),
+        ({"component": ["spherical"]}, "export.where.component: the run has no 'spherical', expected values ["),
+        ({"level": [0, 2], "component": ["clean", "distance"]}, None),
+    ],
+)
+def test_an_export_selects_levels_and_components_that_the_plan_samples(
+    where: dict[str, Any], message: str | None, tmp_path: Path
+) -> None:
+    file = tmp_path / "one.yaml"
+    plan = {"axes": {"camera": {"levels": [1, 2], "components": ["distance"]}}, "episodes": {"camera": 1}}
+    file.write_text(yaml.safe_dump({"name": "one", "plan": plan, "export": {"rlds": {}, "where": where}}))
+    if message is None:
+        assert load(file).export.where == Where.model_validate(where)
+        return
+    with pytest.raises(PipelineError) as caught:
+        load(file)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("axes", ["", "\n    camera:\n    noise: {levels: [3]}"])
+def test_an_axis_whose_options_are_all_comments_has_its_defaults(axes: str, tmp_path: Path) -> None:
+    file = tmp_path / "comments.yaml"
+    file.write_text(f"name: comments\nplan:\n  axes:{axes}\n  episodes: {{camera: 1, noise: 1}}\n")
+    plan = load(file).plan
+    assert plan.axes.camera == CameraAxis()
+    assert plan.axes.noise
+    assert plan.axes.noise.levels == ((3,) if axes else LEVELS)
 
 
 @pytest.mark.parametrize("keys", [("name",), ("export", "rlds", "name"), ("export", "lerobot", "name")])

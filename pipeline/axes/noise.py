@@ -71,8 +71,8 @@ class NoisePerturbation(PixelPerturbation):
         height, width, _ = frame.shape
         if (height, width) == (SIZE_PX, SIZE_PX):
             return self.effect.apply(frame, rng)
-        corrupted = self.effect.apply(_resized(frame, SIZE_PX, SIZE_PX), rng)
-        return _resized(corrupted, height, width)
+        corrupted = self.effect.apply(_scaled(frame, SIZE_PX, SIZE_PX), rng)
+        return _scaled(corrupted, height, width)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances to the component's test severities of all tasks: 0.5 is half way to the next severity.
@@ -117,8 +117,8 @@ class NoisePerturbation(PixelPerturbation):
         return upper - (steps[upper] - value) / (steps[upper] - steps[upper - 1])
 
 
-def _resized(frame: Frame, height: int, width: int) -> Frame:
-    """Resize a frame (H, W, 3): smaller by the mean of the covered pixels, larger linearly."""
+def _scaled(frame: Frame, height: int, width: int) -> Frame:
+    """Scale a frame (H, W, 3): smaller by the mean of the covered pixels, larger linearly."""
     import cv2  # takes long, and every process of a run imports the axes
 
     is_smaller = height * width < frame.shape[0] * frame.shape[1]

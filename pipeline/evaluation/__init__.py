@@ -1,9 +1,21 @@
 """Evaluation of policies on LIBERO's tasks, LIBERO-Plus's test tasks and held-out perturbations of the axes.
 
-Modules, each listed above the modules that it uses:
+Modules, those of an evaluation from the command to its parts:
 
-* ``harness``: for vla-eval. ``lerobot_eval``: for lerobot-eval, over ``gym_environment``. ``composition``: the gap.
-* ``evaluate``: all episodes, in worker processes. ``rollout``: one episode, from task to row. ``selection``: tasks.
-* ``environment`` over ``simulator``: starts episodes, observes, takes actions. ``reference_policies``, ``policies``.
-* ``statistics``, ``results``; ``libero_plus``, ``held_out``, ``tasks``: sources of tasks, and their identification.
+* ``evaluate``: all episodes, in worker processes. ``rollout``: one episode, from task to row.
+* ``selection``, ``task_list``: the tasks of an evaluation. ``libero_plus``, ``held_out`` with ``held_out_sight``,
+  ``recordings``, ``tasks``: sources of tasks, and their identification.
+* ``environment`` over ``simulator``: starts episodes, observes, takes actions.
+* ``policies``: interface of a policy. ``model_server``, ``checkpoint``, ``reference_policies``: policies. ``actions``:
+  checks of their answers.
+* ``results``, ``statistics``: stored results, and their rates and intervals.
+
+Evaluations by other programs: ``harness`` for vla-eval; ``lerobot_eval`` for lerobot-eval, over ``gym_environment``;
+``other_programs`` reads the results of their own LIBERO-Plus environments.
+
+Analyses: ``composition`` (the gap), ``construction`` and ``grading`` (a benchmark of your own), ``focus``; ``tested``
+reads outcomes on LIBERO-Plus's test tasks.
+
+Comparison of a first observation: ``frame_report`` over ``frame_search``, ``start_frames``, ``picture_fit`` and
+``picture_points``.
 """

@@ -100,10 +100,11 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
     }
     write_json(evaluation.folder / "summary.json", summarised)
-    # Other calls have written results of other tasks; equal settings are those of this call's results.
-    settings_here = [row.settings for row in rows[:1]]
-    in_folder = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]
-    evaluation.files.write_table(row for row in in_folder if row.settings in settings_here)
+    # Other calls have written results of other tasks; equal settings are those of this call's results. A call without
+    # any result does not know them, and leaves the table as it is.
+    if rows:
+        in_folder = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]
+        evaluation.files.write_table(row for row in in_folder if row.settings == rows[0].settings)
     if faults:
         raise _without_result([*faults.items()])
     return summarised

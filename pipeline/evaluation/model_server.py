@@ -49,6 +49,7 @@ class Server:
         address: address of the server, such as ``ws://localhost:8000``.
         timeout_s: time limit of an answer.
         look_every: number of control steps between two observations, see ``NextLook``.
+        actions: action space of the server's answers, ``delta`` or ``absolute``.
         state_angle: range of the angle of the state's axis-angle, in place of the range that the server requests.
 
     Attributes:

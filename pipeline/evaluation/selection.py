@@ -51,7 +51,7 @@ class Selection(Frozen, use_attribute_docstrings=True):
     components: tuple[ComponentName, ...] = ()
     """only these components, which the same command lists"""
     levels: tuple[int, ...] = ()
-    """only these levels, 1 to 5"""
+    """only these levels, 1 to 5; 0 selects tasks without a level"""
     tasks: tuple[str, ...] = ()
     """shell-style patterns, one of which must match the name of the task or of its LIBERO task, or suite/name"""
     episodes: int = Field(default=1, ge=1)

@@ -22,8 +22,9 @@ def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
 
 
 def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
-    """Resize a frame: smaller by the mean of the area that a pixel covers, larger by the nearest pixel.
+    """Resize a frame: smaller by the mean of the area that a pixel covers, larger as OpenCV's INTER_AREA.
 
+    The latter repeats pixels at whole factors, and blends neighbours at others.
     If the frame has the requested size already, return the frame itself.
     """
     if frame.shape[:2] == (height_px, width_px):

@@ -58,7 +58,7 @@ The joints of LIBERO's drawers, doors and knobs are zero where the thing is clos
 """
 
 
-class _Deed(NamedTuple):
+class _Manipulation(NamedTuple):
     """Manipulation of one thing, from the step at which it is reached until it is left."""
 
     reached: int
@@ -97,17 +97,17 @@ def subtasks_by_contacts(
         pairs: pairs (C, 2) of bodies in contact in each of its K+1 states.
     """
     problem, seen = definition_of(task), _Seen(trajectory, model, pairs)
-    deeds: set[_Deed] = set()
+    manipulations: set[_Manipulation] = set()
     for fact in problem.goal:
-        deeds.update(seen.deeds(problem, fact))
+        manipulations.update(seen.manipulations(problem, fact))
     sequence: list[Subtask] = []
     begin = 0
-    for deed in sorted(deeds):
-        for step, text in (Subtask(begin, f"approach {deed.thing}"), *deed.subtasks):
+    for manipulation in sorted(manipulations):
+        for step, text in (Subtask(begin, f"approach {manipulation.thing}"), *manipulation.subtasks):
             first_step = max(step, sequence[-1].step + SHORTEST) if sequence else 0
             if first_step < len(trajectory.actions):
                 sequence.append(Subtask(first_step, text))
-        begin = deed.left
+        begin = manipulation.left
     if sequence and sequence[-1].text.startswith("approach "):
         sequence.pop()  # The trajectory ends before the manipulation has its turn.
     return tuple(sequence)
@@ -123,14 +123,14 @@ class _Seen:
         self.closing = np.append(trajectory.actions[:, 6] > 0, False)
         self.robot = self._below(self.model.body("robot0_base").id)
 
-    def deeds(self, problem: Bddl, fact: Fact) -> Iterator[_Deed]:
+    def manipulations(self, problem: Bddl, fact: Fact) -> Iterator[_Manipulation]:
         """Yield the manipulations that belong to a fact of the goal."""
         if fact[1] in problem.targets:
             yield from self._with_object(problem, fact)
         if {*problem.things_named(fact[-1:])} & problem.fixtures.keys():
             yield from self._with_part(problem, fact)
 
-    def _with_object(self, problem: Bddl, fact: Fact) -> Iterator[_Deed]:
+    def _with_object(self, problem: Bddl, fact: Fact) -> Iterator[_Manipulation]:
         """Yield the manipulations of the fact's movable object: it is pushed, or grasped, moved and placed."""
         body = self._below(self.model.body(f"{fact[1]}_main").id)
         left_finger = self._below(self.model.body("gripper0_leftfinger").id)
@@ -147,32 +147,27 @@ class _Seen:
             lifted = grips[~resting[grips] | (_distances(place[grips], place[grips[:1]]) >= LIFTED_M)]
             if _distances(place[reached : left + 1], place[reached]).max() < MOVED_M:
                 continue
-            if not len(lifted):
-                heights_m = place[reached : left + 1, 2]
-                if heights_m.max() - heights_m[0] < CARRIED_M:
-                    yield _Deed(reached, left, thing_at_start, (Subtask(reached, f"push {thing_at_start} {to}"),))
-                    continue
+            heights_m = place[reached : left + 1, 2]
+            if len(lifted):
+                grasp = np.flatnonzero(~self.closing[: lifted[0]]).max(initial=-1) + 1
+                placed = _put_down(resting, int(lifted[0]), int(grips[-1]) + 1)
+                subtasks = [
+                    Subtask(int(grasp), f"grasp {thing_at_start}"),
+                    Subtask(int(lifted[0]), f"move {thing} {to}"),
+                    Subtask(placed, f"place {thing} {at}"),
+                ]
+            elif heights_m.max() - heights_m[0] < CARRIED_M:
+                subtasks = [Subtask(reached, f"push {thing_at_start} {to}")]
+            else:
                 rising = reached + int(np.argmax(heights_m >= heights_m[0] + LIFTED_M))
-                carried = [Subtask(rising, f"move {thing} {to}")]
+                subtasks = [Subtask(rising, f"move {thing} {to}")]
                 higher = np.flatnonzero(heights_m >= heights_m[-1] + LIFTED_M)
                 # The trajectory may end before the object comes down.
                 if len(higher):
-                    carried.append(Subtask(reached + int(higher[-1]) + 1, f"place {thing} {at}"))
-                yield _Deed(reached, left, thing_at_start, tuple(carried))
-                continue
-            grasp = np.flatnonzero(~self.closing[: lifted[0]]).max(initial=-1) + 1
-            release = int(grips[-1]) + 1
-            # Steps at which the lifted object comes to rest and stays at rest until about its release.
-            put_down = []
-            for start, end in _runs(resting[:release]):
-                if start > lifted[0] + GAP and end > release - GAP:
-                    put_down.append(start)
-            # ``map`` ends with the three texts, so the release is used only if the object was not put down before.
-            steps = (int(grasp), int(lifted[0]), *put_down[-1:], release)
-            texts = (f"grasp {thing_at_start}", f"move {thing} {to}", f"place {thing} {at}")
-            yield _Deed(reached, left, thing_at_start, tuple(map(Subtask, steps, texts)))
+                    subtasks.append(Subtask(reached + int(higher[-1]) + 1, f"place {thing} {at}"))
+            yield _Manipulation(reached, left, thing_at_start, tuple(subtasks))
 
-    def _with_part(self, problem: Bddl, fact: Fact) -> Iterator[_Deed]:
+    def _with_part(self, problem: Bddl, fact: Fact) -> Iterator[_Manipulation]:
         """Yield the manipulations of the fact's drawer, door or knob: each turn of one of its joints."""
         name, state = fact[-1], fact[0] if len(fact) == 2 else "open"
         site = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, name)
@@ -191,7 +186,7 @@ class _Seen:
                 change = turned[min(left, len(turned) - 1)] - turned[reached]
                 if abs(change) >= TURNED:
                     verb = away if change > 0 else back
-                    yield _Deed(reached, left, thing, (Subtask(reached, f"{verb} {thing}"),))
+                    yield _Manipulation(reached, left, thing, (Subtask(reached, f"{verb} {thing}"),))
 
     def _below(self, body: int) -> Mask:
         """Return a mask (nbody,) of a body and the bodies that move with it.
@@ -206,6 +201,18 @@ class _Seen:
     def _touch(self, first: Mask, second: Mask) -> Mask:
         """Return a mask (K+1,) of the states in which any body of ``first`` touches any body of ``second``."""
         return np.array([bool((first[pairs] & second[pairs[:, ::-1]]).any()) for pairs in self.pairs])
+
+
+def _put_down(resting: Mask, lifted: int, release: int) -> int:
+    """Return the step at which a lifted object is put down: it then rests until about its release, the last grip's end.
+
+    An object that does not rest before its release is put down by the release.
+    """
+    step = release
+    for start, end in _runs(resting[:release]):
+        if start > lifted + GAP and end > release - GAP:
+            step = start
+    return step
 
 
 def _distances(places: Floats, origin: Floats) -> Floats:

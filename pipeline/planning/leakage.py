@@ -2,7 +2,7 @@
 
 Clearance and coverage conflict: a plan far from all test tasks overlaps with no test task, and prepares for none. The
 report therefore states the least distance of any pair. For each component, it also states the distances from the test
-tasks to the planned episodes.
+tasks to the wanted episodes.
 
 Every perturbation is read back from the plan and compared again, independently of the planner. A row with several
 perturbations counts for each of its axes: the benchmark perturbs one axis at a time, but each part must keep its

@@ -13,11 +13,12 @@ from pipeline.seeding import digest
 
 @dataclass(frozen=True)
 class Stream:
-    """View under the perturbations that show in it.
+    """View under perturbations.
 
     Attributes:
         view: its name in ``schemas/episode.json``, such as ``image``.
-        perturbations: render and pixel layers, in the order they apply.
+        perturbations: perturbations in the order they apply. ``streams_of`` lists only those that show in the view;
+            rendering ignores all others.
     """
 
     view: str

@@ -1,7 +1,8 @@
 """Preview: the effect of an axis or a combination on a task, as a contact sheet in the manner of the paper's appendix.
 
 Every picture shows the first state of the demonstration without a replay. A single push is shown in its replay, and a
-push of a combination at its end. A plan with the same seed samples the same perturbations for the demonstration.
+push of a combination at its end. A plan with the same seed samples the same perturbations for the demonstration,
+unless several demonstrations of a task share the list of ``language`` or ``goal``.
 """
 
 from collections.abc import Iterable, Sequence

@@ -9,7 +9,7 @@ from pipeline.catalogue.scene_files import portable
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import Content
 from pipeline.files import Edition, edition
-from pipeline.identity import versions
+from pipeline.identity import version_column, versions
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
@@ -52,7 +52,7 @@ class EpisodeLoader:
         rendered = self._frames.load(row.trajectory_id, stream_ids, set(geometry.values()))
         values = asdict(row) | {"replay_mode": rendered.replay_mode}
         values |= asdict(rendered.quality) if rendered.quality else {}
-        values |= {f"{name}_version": version for name, version in versions().items()}
+        values |= {version_column(name): version for name, version in versions().items()}
         if self.failures:
             verdict = TrajectoryStore(self.data / TRAJECTORIES).load(row.trajectory_id).verdict
             values |= {"success": verdict.kept, "reason": verdict.reason}

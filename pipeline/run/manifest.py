@@ -16,7 +16,7 @@ from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import Where
-from pipeline.identity import DISTRIBUTION, VERSIONS, versions
+from pipeline.identity import DISTRIBUTION, VERSIONS, version_column, versions
 from pipeline.libero.tasks import exceeds_step_limit
 from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED
@@ -149,11 +149,6 @@ def build(
 def _ratio(replayed: Mapping[str, Any], twin: Mapping[str, Any]) -> float | None:
     path_m, twin_path_m = replayed.get("path_m"), twin.get("path_m")
     return path_m / twin_path_m if path_m is not None and twin_path_m else None
-
-
-def version_column(name: str) -> str:
-    """Return the name of the column for the version of a package."""
-    return f"{name.replace('-', '_')}_version"
 
 
 def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:

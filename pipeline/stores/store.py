@@ -1,8 +1,9 @@
 """Folder of files that one stage writes, and a table of their contents.
 
-A file is complete or absent, and is named after its content. A changed plan therefore never uses a file of another
-perturbation, and still finds every file that it shares with the earlier plan. Only a file that does not exist is
-missing. A file that cannot be read is an error, so no work is silently repeated.
+A file is complete or absent, and is named after its inputs. A changed plan therefore never uses a file of another
+perturbation, and still finds every file that it shares with the earlier plan. A file is missing if it does not exist or
+has the fingerprint of other recipes, packages or settings. A file that cannot be read is an error, so no work is
+silently repeated.
 
 The table has a row for each file, so stages need not open every file to learn a verdict or a length. A row is valid
 while its file has the recorded size and is older than the table. Any other file is opened and read. The metadata of the

@@ -20,7 +20,7 @@ from pipeline.formats.base import Row
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, info_of, record_at
-from pipeline.identity import versions
+from pipeline.identity import version_column, versions
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
@@ -70,7 +70,7 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
         identical = rebuilt is not None and (rebuilt[0] == stored[0] or (other_version and not differs))
     other_versions = {}
     for name, here in versions().items():
-        recorded = row[manifest.version_column(name)]
+        recorded = row[version_column(name)]
         if recorded != here:
             other_versions[name] = {"manifest": recorded, "here": here}
     return {

@@ -232,12 +232,18 @@ def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
         policy = PolicyConfig(kind="server", address=address, label="faulty", timeout_s=10)
         with pytest.raises(PipelineError, match="2 episodes without a result") as raised:
             evaluate(Evaluation(RECORDED, policy, policy.identity(), tmp_path), FAULTY_AND_STOVE, loop)
+        assert json.loads((tmp_path / "summary.json").read_text())["all"]["episodes"] == 1
+        table = (tmp_path / "episodes.csv").read_text()
+        plate_alone = Selection(suites=("libero_goal",), tasks=("push_the_plate*",))
+        with pytest.raises(PipelineError, match="1 episode without a result"):
+            evaluate(Evaluation(RECORDED, policy, policy.identity(), tmp_path), plate_alone, loop)
+    assert (tmp_path / "episodes.csv").read_text() == table, "the earlier result stays"
+    assert "turn_on_the_stove" in table
     for told in ("within 10 s", "pick_up_the_milk", "no such camera", "push_the_plate"):
         assert told in str(raised.value)
     (row,) = EpisodeFiles(tmp_path).rows()
     assert row.base == "turn_on_the_stove"
     assert row.success
-    assert json.loads((tmp_path / "summary.json").read_text())["all"]["episodes"] == 1
 
 
 @pytest.mark.slow
