@@ -33,7 +33,7 @@ from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import select_tasks
 from pipeline.machine_code import ensure_fixed_machine_code
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.types import Task
 from pipeline.validation.needs import PUBLISHED
 
@@ -74,7 +74,7 @@ def demonstrations(wanted: DemosConfig) -> None:
 
 def _recordings(task: Task, starter: StarterSource) -> Iterator[hdf5.Recording]:
     demo = starter.demonstration(task)
-    model_xml = demo.model_xml or shared(task).place_fixtures(0)
+    model_xml = demo.model_xml or environment_of(task).place_fixtures(0)
     for number in range(PUBLISHED):
         noise = seeding.rng("rehearsal", number).normal(0, [*[0.01] * 6, 0], (STEPS, 7))  # no noise on the gripper
         actions = np.clip(demo.actions[:STEPS] + noise, -1, 1)

@@ -31,7 +31,7 @@ from pipeline.libero import bddl
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import tasks
 from pipeline.machine_code import ensure_fixed_machine_code
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.physics.replay import replay
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import LEAST_PX, Sight
@@ -60,7 +60,7 @@ def main() -> None:
 def measure(task: Task) -> list[dict[str, Any]]:
     """Return a line for LIBERO's own camera and for each test camera of a task."""
     demo = StarterSource().demonstration(task)
-    trajectory = replay(shared(task), demo, "test_cameras", ReplayConfig(mode="open_loop"))
+    trajectory = replay(environment_of(task), demo, "test_cameras", ReplayConfig(mode="open_loop"))
     arena = bddl.read(task.bddl_file).arena
     renderer = Renderer(trajectory.model_xml)
     hand_m = hand_way(renderer, trajectory)

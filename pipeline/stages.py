@@ -43,16 +43,15 @@ from pipeline.run.layout import (
     SHEETS,
     STATISTICS,
 )
-from pipeline.run.outcome import outdated, rejections
-from pipeline.run.render_stage import render_plan
+from pipeline.run.outcome import outdated
+from pipeline.run.render_stage import render_and_replace
 from pipeline.run.replay_stage import Replays
 from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
-from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.testset import benchmark
 
 EVERY_TIME = "the stage runs every time"
-"""Reason of a stage without outputs of its own, which decides itself if work is left."""
+"""Reason of a stage without outputs of its own."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,7 @@ class Stage:
     """A step of a run.
 
     Attributes:
-        work: function that performs the stage. A stage without outputs runs every time and decides itself if work is
-            left.
+        work: function that performs the stage. A stage without outputs and memory runs every time.
         settings: sections of ``settings.json`` that its outputs depend on.
         inputs: files and folders of the run that it reads.
         outputs: files and folders of the run that it writes.
@@ -69,6 +67,7 @@ class Stage:
             shard behind the record of its dataset; `None` if all of them are unchanged.
         memory: function that returns the memory of the last call, if it does not follow from settings, inputs and
             outputs.
+        always: function that is called at the end, also if the outputs were up to date.
     """
 
     work: Callable[[Run], None]
@@ -77,6 +76,7 @@ class Stage:
     outputs: Sequence[str] = ()
     changed_file: Callable[[Run], Path | None] | None = None
     memory: Callable[[Run], Memory] | None = None
+    always: Callable[[Run], None] | None = None
 
 
 def write_inputs(run: Run) -> None:
@@ -176,16 +176,7 @@ def render(run: Run) -> None:
     replayed = int(read_json(run.path(REPLAY))["replayed"])
     with run.workers(renders=True) as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
-        rejected: dict[str, str] | None = None
-        # `render_plan` renders the reserves that are already replayed. This loop replays the other reserves.
-        while True:
-            rejected_now = rejections(rows, frames_by_trajectory(run.frames.rows()), config.render.content.views)
-            if rejected_now == rejected:
-                break
-            rejected = rejected_now
-            verdicts = replays.complete(rows, rejected)
-            rendered = render_plan(rows, config, run.trajectories, run.frames, workers)
-            run.frames.keep(rendered)
+        verdicts, rendered = render_and_replace(rows, config, replays, run.frames)
     run.trajectories.keep(verdicts)
     further = len(verdicts) - replayed
     if further:
@@ -243,16 +234,11 @@ def write_manifest(run: Run) -> None:
 
 def validate(run: Run) -> None:
     """Reopen the datasets and the manifest, and stop if they differ from the generated episodes."""
-    file = run.validation_file
-    if finished.validate_memory(run).holds():
-        # `push` requires checks that are no older than the checked files.
-        file.touch()
-        print(f"nothing has changed since the last checks, which found no errors: see {file}")
-        return
     from pipeline.validation.validate import validate as validate_run
 
     with run.workers(renders=True) as workers:
         report = validate_run(run, workers)
+    file = run.validation_file
     write_json(file, report)
     errors = {check: result["findings"] for check, result in report.items() if result["findings"]}
     if errors:
@@ -264,8 +250,12 @@ def validate(run: Run) -> None:
             expected=first["expected"],
             remedy=f"read {file}, correct the cause, and run `{MAKE_AGAIN}` again",
         )
-    finished.validate_memory(run).keep()
     print(f"{len(report)} checks found no errors, see {file}")
+
+
+def date_validation(run: Run) -> None:
+    """Give the report of ``validate`` the present date: `push` requires checks no older than the checked files."""
+    run.validation_file.touch()
 
 
 def write_recipe(run: Run) -> None:
@@ -281,20 +271,8 @@ def write_recipe(run: Run) -> None:
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
 
 
-def summarize(run: Run) -> None:
+def render_sheets(run: Run) -> None:
     """Render contact sheets, of the run and of one task per suite, and print the run's counts."""
-    rows, episodes = run.manifest, run.config.plan.episodes
-    memory = finished.summary_memory(run)
-    if not memory.holds():
-        _render_sheets(run)
-        memory.keep()
-    Console().print(counts.shown(rows, episodes))
-    print(counts.Diversity.of(rows))
-    for sentence in (*counts.shortfalls(counts.targets(rows, episodes)), *counts.beyond_step_limit(rows)):
-        print(sentence)
-
-
-def _render_sheets(run: Run) -> None:
     from pipeline.report import preview, sheets
 
     sheets.write(run.manifest, run.episodes(), run.path(SHEETS))
@@ -303,6 +281,15 @@ def _render_sheets(run: Run) -> None:
         with run.workers(renders=True) as workers:
             preview.for_run(run.config, run.path(PREVIEWS), workers)
         previews.keep()
+
+
+def print_counts(run: Run) -> None:
+    """Print the run's counts, and its missed targets."""
+    rows, episodes = run.manifest, run.config.plan.episodes
+    Console().print(counts.shown(rows, episodes))
+    print(counts.Diversity.of(rows))
+    for sentence in (*counts.shortfalls(counts.targets(rows, episodes)), *counts.beyond_step_limit(rows)):
+        print(sentence)
 
 
 def write_card(run: Run) -> None:
@@ -315,14 +302,15 @@ def write_card(run: Run) -> None:
 
 def write_report(run: Run) -> None:
     """Write one HTML page about the run, which contains its counts, plots, pictures and videos."""
-    file = run.report_file
-    memory = finished.report_memory(run)
-    if not memory.holds():
-        from pipeline.report import report
+    from pipeline.report import report
 
-        write(file, report.page(run, benchmark.load()))
-        memory.keep()
-    print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB), which opens in any browser")
+    write(run.report_file, report.page(run, benchmark.load()))
+
+
+def name_report(run: Run) -> None:
+    """Print where the report is."""
+    file = run.report_file
+    print(f"report: {file} ({file.stat().st_size / 1e6:.1f} MB), which opens in any browser")
 
 
 def _changed_replay(run: Run) -> Path | None:
@@ -359,11 +347,11 @@ STAGES = {
     ),
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
     "manifest": Stage(write_manifest, _LABELLED, (INPUTS, *_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
-    "validate": Stage(validate),
+    "validate": Stage(validate, memory=finished.validate_memory, always=date_validation),
     "recipe": Stage(write_recipe, ("export", "finetune"), (MANIFEST, *_RECORDS), (FINETUNE,)),
-    "summary": Stage(summarize),
+    "summary": Stage(render_sheets, memory=finished.summary_memory, always=print_counts),
     "card": Stage(write_card, inputs.PUBLISHED, (MANIFEST, *REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
-    "report": Stage(write_report),
+    "report": Stage(write_report, memory=finished.report_memory, always=name_report),
 }
 """Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""
 
@@ -385,7 +373,7 @@ def run_all(file: Path) -> Run:
 
 
 def perform(name: str, run: Run, title: str = "") -> None:
-    """Perform a stage, unless its inputs and outputs are unchanged since the last call.
+    """Perform a stage, unless its inputs and outputs are unchanged since the last call; then call its ``always``.
 
     Args:
         title: printed first; the name by default.
@@ -393,18 +381,20 @@ def perform(name: str, run: Run, title: str = "") -> None:
     Raises:
         PipelineError: when the stage stops.
     """
-    reason = why_not(name, run)
+    stage, reason = STAGES[name], why_not(name, run)
     if reason is None:
         print(f"{title or name}: up to date", flush=True)
-        return
-    print(title or name, flush=True)
-    if reason not in (EVERY_TIME, finished.NO_RECORD):
-        print(f"  reason: {reason}", flush=True)
-    reject_foreign_files(run.folder)
-    STAGES[name].work(run)
-    after = _memory(name, Run(run.config))
-    if after is not None:
-        after.keep()
+    else:
+        print(title or name, flush=True)
+        if reason not in (EVERY_TIME, finished.NO_RECORD):
+            print(f"  reason: {reason}", flush=True)
+        reject_foreign_files(run.folder)
+        stage.work(run)
+        after = _memory(name, Run(run.config))
+        if after is not None:
+            after.keep()
+    if stage.always is not None:
+        stage.always(run)
 
 
 def why_not(name: str, run: Run) -> str | None:

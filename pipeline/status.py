@@ -139,11 +139,7 @@ def _follow(run: Run) -> Iterator[tuple[str, str]]:
     if stale:
         yield "manifest and later stages", "the datasets would change"
         return
-    yield from _outdated(run, ("manifest", "recipe", "card"))
-    for memory in (finished.validate_memory(run), finished.summary_memory(run), finished.report_memory(run)):
-        changed = memory.why_not()
-        if changed is not None:
-            yield memory.stage, changed
+    yield from _outdated(run, ("manifest", "validate", "recipe", "summary", "card", "report"))
 
 
 def _outdated(run: Run, names: Sequence[str]) -> Iterator[tuple[str, str]]:

@@ -32,7 +32,7 @@ from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.machine_code import MACHINE_CODE_VARIABLES
-from pipeline.physics.environment import Environment, shared
+from pipeline.physics.environment import Environment, environment_of
 from pipeline.physics.replay import replay
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
@@ -140,7 +140,7 @@ def shown(request: pytest.FixtureRequest) -> Iterator[Renderer]:
 def memory() -> Iterator[None]:
     """Release a module's memory after its tests: an environment or an open scene takes half a gigabyte."""
     yield
-    shared.cache_clear()
+    environment_of.cache_clear()
     gc.collect()
     LIBC.malloc_trim(0)
 

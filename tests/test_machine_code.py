@@ -127,10 +127,10 @@ def test_no_demonstration_is_replayed_with_other_machine_code() -> None:
 from pipeline.config import ReplayConfig
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.physics.replay import replay
 task = find_task("libero_goal", "turn_on_the_stove")
-replay(shared(task), StarterSource().demonstration(task), "clean", ReplayConfig())
+replay(environment_of(task), StarterSource().demonstration(task), "clean", ReplayConfig())
 """
     done = run_with_other_code("-c", script)
     assert "NumPy computes with Sandybridge" in done.stderr

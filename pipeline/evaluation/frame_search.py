@@ -185,8 +185,8 @@ def _others(task: Task) -> list[Task]:
     listed = [other for other in libero_tasks.tasks(task.suite) if other.name != task.name]
     if len(listed) < FEW_TASKS:
         return listed
-    by_scene = {libero_tasks.shared(other, "scene"): other for other in reversed(listed)}
-    by_scene.pop(libero_tasks.shared(task, "scene"), None)
+    by_scene = {libero_tasks.common_key(other, "scene"): other for other in reversed(listed)}
+    by_scene.pop(libero_tasks.common_key(task, "scene"), None)
     return list(reversed(by_scene.values()))
 
 

@@ -20,7 +20,7 @@ from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
 from pipeline.grouping import grouped
 from pipeline.libero.carried import definition_of
-from pipeline.libero.tasks import find_task, shared
+from pipeline.libero.tasks import common_key, find_task
 from pipeline.physics.replay import roll_out
 from pipeline.planning import plan
 from pipeline.rendering.renderer import LastScene
@@ -202,7 +202,7 @@ class PlannedPerturbations:
 
 def _comparable(perturbation: Perturbation, task: Task) -> Hashable:
     """Return a key that is equal for perturbations between which a distance is defined."""
-    return type(perturbation), perturbation.same and shared(task, perturbation.same)
+    return type(perturbation), perturbation.same and common_key(task, perturbation.same)
 
 
 def planned(file: Path) -> PlannedPerturbations:

@@ -179,7 +179,7 @@ def exceeds_step_limit(suite: str, steps: int) -> bool | None:
     return steps > STEP_LIMITS[suite] if suite in STEP_LIMITS else None
 
 
-def shared(task: Task, same: Same) -> Hashable:
+def common_key(task: Task, same: Same) -> Hashable:
     """Return a key that is equal for tasks that have the part ``same`` in common."""
     match same:
         case "task":

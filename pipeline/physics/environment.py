@@ -320,6 +320,6 @@ class Environment:
 
 
 @lru_cache(maxsize=1)
-def shared(task: Task) -> Environment:
+def environment_of(task: Task) -> Environment:
     """Return this process's environment for ``task``; restore a scene before you step it."""
     return Environment(task)

@@ -19,7 +19,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RejectedError
 from pipeline.libero.starts import LEFT_OUT_STEPS, kept_actions, recorded_start
 from pipeline.machine_code import fixed_machine_code
-from pipeline.physics.environment import Environment, UnusableSceneError, shared
+from pipeline.physics.environment import Environment, UnusableSceneError, environment_of
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Route, follow
 from pipeline.types import Demo, Floats, Push, Scene, Task, Trajectory, Verdict
@@ -224,7 +224,7 @@ _Start = tuple[str, bytes, float, tuple[float, ...] | None, Push | None]
 def _states(task: Task, start: _Start, actions: bytes, settle_steps: int) -> Floats:
     """Execute actions (the bytes of (K, 7) float64) from a settled start and return the states (K+1, S)."""
     model_xml, state, gripper, posture_rad, push = start
-    environment = shared(task)
+    environment = environment_of(task)
     environment.restore(Scene(model_xml, np.frombuffer(state), gripper=gripper, posture_rad=posture_rad, push=push))
     environment.settle(settle_steps)
     states = [environment.state]

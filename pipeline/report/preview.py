@@ -23,7 +23,7 @@ from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import Problem
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import at_reset, compute_settled_state, replay, roll_out
 from pipeline.planning.plan import Sampler
@@ -52,7 +52,7 @@ REJECTED_GREY = (160, 160, 160)
 
 
 @dataclass
-class Stage:
+class StagedTask:
     """A task set up for rendering.
 
     Attributes:
@@ -90,13 +90,13 @@ class Stage:
             task = perturbation.played(task)
             seed = perturbation.reset_seed
             if seed is not None:
-                demo = at_reset(shared(task), replace(self.demo, task=task), seed)
+                demo = at_reset(environment_of(task), replace(self.demo, task=task), seed)
                 return demo, recorded_start(demo, str(demo.model_xml), settles=self.replay.settle_steps > 0)
         return self.demo, self.scene
 
     @cached_property
     def _twin(self) -> Trajectory:
-        return replay(shared(self.demo.task), self.demo, "twin", self.replay)
+        return replay(environment_of(self.demo.task), self.demo, "twin", self.replay)
 
     def strip(self, perturbation: Perturbation) -> list[tuple[int, list[Frame]]]:
         """Render the agent view at some steps of a pushed replay, without and with the push.
@@ -109,7 +109,7 @@ class Stage:
             raise RejectedError(twin.verdict.reason)
         reference = Reference.of(twin.model_xml, twin.states, twin.actions)
         changes = of_layer((perturbation,), PhysicsPerturbation)
-        pushed = replay(shared(self.demo.task), self.demo, "pushed", self.replay, changes, lambda: reference)
+        pushed = replay(environment_of(self.demo.task), self.demo, "pushed", self.replay, changes, lambda: reference)
         push = pushed.scene.push
         if push is None:
             raise RejectedError(pushed.verdict.reason)
@@ -125,7 +125,7 @@ class Stage:
         return steps_and_frames
 
 
-def staged(tasks: Iterable[Task], config: Config) -> Stage:
+def staged(tasks: Iterable[Task], config: Config) -> StagedTask:
     """Set up the first demonstration of any of the tasks in the configured source.
 
     Its scenes are rendered in the scene of this process (``scene_of_process``), which the caller closes at the end.
@@ -149,8 +149,8 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
     demo = source.load(index.entries[0].demo_id)
     model_xml = demo.model_xml
     if model_xml is None:
-        model_xml = shared(demo.task).place_fixtures(config.replay.fixture_seed)
-    return Stage(
+        model_xml = environment_of(demo.task).place_fixtures(config.replay.fixture_seed)
+    return StagedTask(
         demo, recorded_start(demo, model_xml, settles=config.replay.settle_steps > 0), scene_of_process(), config.replay
     )
 
@@ -218,7 +218,7 @@ def combinations(
     return sorted(chosen, key=lambda perturbations: [(p.component, p.level) for p in perturbations])
 
 
-def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
+def axis_sheet(stage: StagedTask, name: str, config: Config, test: TestSet) -> Image.Image:
     """Render the sheet of an axis or a combination: the original first, then the variants with their parameters.
 
     A grey tile with the reason replaces a perturbation that is impossible in the scene.
@@ -258,7 +258,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     return sheet(f"{demo.demo_id}, {moment}; {kind} {name}, seed {seed}; {', '.join(views)}", tiles)
 
 
-def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
+def _strip(stage: StagedTask, perturbations: Sequence[Perturbation]) -> list[Tile]:
     """Render the strip of a push that is the only perturbation; empty for any other perturbation."""
     push = perturbations[0]
     if len(perturbations) > 1 or push.acts_until is None:
@@ -271,7 +271,7 @@ def _strip(stage: Stage, perturbations: Sequence[Perturbation]) -> list[Tile]:
     return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in steps_and_frames]
 
 
-def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
+def overview(stage: StagedTask, config: Config, test: TestSet) -> Image.Image:
     """Render one sheet of all axes: the agent view of the clean twin, then one perturbation of each axis that applies.
 
     The perturbation of an axis is one of the plan's first that is possible in the scene, with the level nearest to
@@ -291,7 +291,7 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     return sheet(f"{demo.task}: first frame of the agent view, one perturbation of each axis", tiles, 5)
 
 
-def _typical(stage: Stage, sampled: Sequence[Perturbation]) -> Tile:
+def _typical(stage: StagedTask, sampled: Sequence[Perturbation]) -> Tile:
     for perturbation in sorted(sampled, key=lambda p: (abs(p.level - SHOWN_LEVEL), -p.level)):
         caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
         try:

@@ -44,7 +44,7 @@ from pipeline.seeding import digest
 OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]+\.json")
 """Name of the statistics that OpenVLA-OFT's loader stores next to the shards, and reuses even for a later dataset."""
 
-FINISHED = "record.json"
+RECORD_FILE = "record.json"
 """File of a work folder: the record of its whole dataset; later the record next to the dataset."""
 
 BEFORE = "before"
@@ -114,7 +114,7 @@ def _recorded(target: AnyFormat) -> set[str]:
     Records in the work folder are of killed calls, and of datasets with missing or changed files.
     """
     recorded: set[str] = set()
-    for file in target.work.glob(f"*/{FINISHED}"):
+    for file in target.work.glob(f"*/{RECORD_FILE}"):
         recorded |= DatasetRecord.from_json(read_json(file)).files.keys()
     with suppress(PipelineError):  # The dataset has no record, or has changed since.
         recorded |= target.record().files.keys()
@@ -137,7 +137,7 @@ def reject_changed(target: AnyFormat) -> None:
     Raises:
         PipelineError: naming the file, unless ``REMAKE=1`` allows it.
     """
-    _reject_edits(target, target.work / CHANGED / FINISHED)
+    _reject_edits(target, target.work / CHANGED / RECORD_FILE)
 
 
 def _reject_edits(target: AnyFormat, record_file: Path) -> None:
@@ -169,7 +169,7 @@ def reject_unrecorded(folder: Path) -> None:
     """
     record_file = folder.with_name(f"{folder.name}.json")
     # Records in the work folder are of killed calls, and of datasets with missing or changed files.
-    further_records = (folder.parent / WORK / folder.name).glob(f"*/{FINISHED}")
+    further_records = (folder.parent / WORK / folder.name).glob(f"*/{RECORD_FILE}")
     recorded: set[str] = set()
     for file in (record_file, *further_records):
         if file.is_file():
@@ -332,7 +332,7 @@ def notice_changes(target: AnyFormat) -> None:
     Raises:
         PipelineError: when the record is unreadable, because edited files would not be found without it.
     """
-    put_away = target.work / CHANGED / FINISHED
+    put_away = target.work / CHANGED / RECORD_FILE
     if not target.record_file.exists() and put_away.is_file():
         os.replace(put_away, target.record_file)
     if not target.record_file.exists() or untouched(target):
@@ -364,7 +364,7 @@ def put_away_records(work: Path) -> set[Path]:
         work: folder with the work folders of all formats.
     """
     records: set[Path] = set()
-    for record in work.glob(f"*/{CHANGED}/{FINISHED}"):
+    for record in work.glob(f"*/{CHANGED}/{RECORD_FILE}"):
         name_of_format = record.relative_to(work).parts[0]
         if (work.parent / name_of_format).is_dir():
             records.add(record)
@@ -386,8 +386,8 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     """
     pieces, basis = target.pieces(episodes), compute_basis(target, episodes)
     work = target.work / basis.identity
-    keep_below(target.work, {work, target.work / CHANGED / FINISHED})
-    finished = work / FINISHED
+    keep_below(target.work, {work, target.work / CHANGED / RECORD_FILE})
+    finished = work / RECORD_FILE
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, workers)
         # A worker has the format's packages loaded already.
@@ -418,14 +418,14 @@ def _replace(target: AnyFormat, work: Path) -> None:
         foreign = _unrecorded(target.folder, recorded)
         if foreign:
             raise _foreign_entries_error(target, foreign, {name.partition("/")[0] for name in recorded})
-        for record_file in (target.record_file, target.work / CHANGED / FINISHED):
+        for record_file in (target.record_file, target.work / CHANGED / RECORD_FILE):
             _reject_edits(target, record_file)
         if target.folder.exists():
             os.replace(target.folder, target.work / BEFORE)
         target.record_file.unlink(missing_ok=True)  # This record is of the earlier dataset.
         put_in_place(work / "dataset", target.folder)
-    (work / FINISHED).touch()  # No file of the dataset is younger than its record.
-    put_in_place(work / FINISHED, target.record_file)
+    (work / RECORD_FILE).touch()  # No file of the dataset is younger than its record.
+    put_in_place(work / RECORD_FILE, target.record_file)
     _clear_work(target)
 
 

@@ -14,6 +14,7 @@ from pipeline.planning.plan import Row
 from pipeline.planning.selection import select
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.run.outcome import rejections, to_render
+from pipeline.run.replay_stage import Replays
 from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, file_name, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -50,6 +51,33 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
         if portion:
             needed_portions.append(portion)
     return needed_portions
+
+
+def render_and_replace(
+    rows: Sequence[Row], config: Config, replays: Replays, frames: FrameStore
+) -> tuple[dict[str, Verdict], set[str]]:
+    """Render the frames of every kept episode, and replay the reserves that replace episodes with rejected frames.
+
+    ``render_plan`` takes reserves that are already replayed. This loop replays further ones, and ends with a pass in
+    which no further frames are rejected.
+
+    Returns:
+        Trajectory id to verdict, for every trajectory that was needed, and the files of ``frames`` that the plan needs.
+
+    Raises:
+        PipelineError: as ``Replays.complete`` and ``render_plan``.
+    """
+    verdicts: dict[str, Verdict] = {}
+    files: set[str] = set()
+    rejected: dict[str, str] | None = None
+    while True:
+        rejected_now = rejections(rows, frames_by_trajectory(frames.rows()), config.render.content.views)
+        if rejected_now == rejected:
+            return verdicts, files
+        rejected = rejected_now
+        verdicts = replays.complete(rows, rejected)
+        files = render_plan(rows, config, replays.store, frames, replays.workers)
+        frames.keep(files)
 
 
 def render_plan(

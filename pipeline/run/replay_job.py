@@ -13,7 +13,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
 from pipeline.libero.carried import all_counterparts
 from pipeline.libero.starts import kept_actions
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.physics.quality import measure
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import at_reset, replay
@@ -53,7 +53,7 @@ class ReplayJob:
             )
         physics = of_layer(from_json(self.row.perturbations), PhysicsPerturbation)
         task = task_of(self.row.suite, self.row.task, self.row.perturbations)
-        environment = shared(task)
+        environment = environment_of(task)
         reference = partial(self._reference, demo, task)
         start, replay_config = replace(demo, task=task), self.replay_config
         seed = self.row.reset_seed
@@ -88,11 +88,11 @@ class ReplayJob:
         if demo.states is None:
             # Replay the recorded hand motion, which began before anything settled.
             unsettled = self.replay_config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
-            return _reference_of(replay(shared(demo.task), demo, self.row.trajectory_id, unsettled))
+            return _reference_of(replay(environment_of(demo.task), demo, self.row.trajectory_id, unsettled))
         mask = kept_actions(demo.actions, self.replay_config.noops)
         # The state after the last action is not recorded: assume that the hand rests.
         states = np.vstack([demo.states[mask], demo.states[-1:]])
-        model_xml = demo.model_xml or shared(demo.task).place_fixtures(self.replay_config.fixture_seed)
+        model_xml = demo.model_xml or environment_of(demo.task).place_fixtures(self.replay_config.fixture_seed)
         return Reference.of(model_xml, states, demo.actions[mask])
 
     def limit_s(self) -> float:

@@ -13,7 +13,7 @@ from pipeline.catalogue import downloads
 from pipeline.catalogue.downloads import Wheel
 from pipeline.errors import PipelineError
 from pipeline.grouping import grouped
-from pipeline.libero.tasks import Same, find_task, shared, tasks
+from pipeline.libero.tasks import Same, common_key, find_task, tasks
 from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
 
@@ -73,7 +73,7 @@ class TestSet:
 
     def places(self, task: Task, axis: str, same: Same) -> list[int]:
         """Return the indices of the test tasks of ``on`` in the test tasks of ``on_axis``."""
-        return _places(self, axis, same).get(shared(task, same), [])
+        return _places(self, axis, same).get(common_key(task, same), [])
 
     def find(self, suite: str, name: str) -> TestTask:
         """Return the test task of the given name.
@@ -101,18 +101,18 @@ class TestSet:
 def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
     """Group the indices of an axis's test tasks by the ``shared`` key of the task that they perturb."""
     bases = [find_task(test_task.suite, test_task.base) for test_task in test.on_axis(axis)]
-    return grouped((shared(task, same), place) for place, task in enumerate(bases))
+    return grouped((common_key(task, same), place) for place, task in enumerate(bases))
 
 
 @cache
 def is_in_tested_scene(task: Task) -> bool:
     """Return whether a task begins in a scene of a tested suite, as 35 tasks of LIBERO-90 do."""
-    return task.suite in TESTED_SUITES or shared(task, "scene") in _tested_scenes()
+    return task.suite in TESTED_SUITES or common_key(task, "scene") in _tested_scenes()
 
 
 @cache
 def _tested_scenes() -> frozenset[Hashable]:
-    return frozenset(shared(task, "scene") for suite in TESTED_SUITES for task in tasks(suite))
+    return frozenset(common_key(task, "scene") for suite in TESTED_SUITES for task in tasks(suite))
 
 
 @cache

@@ -18,7 +18,7 @@ from pipeline.libero.demonstrations import DemoEntry, HDF5Source
 from pipeline.libero.hdf5 import SUFFIX, demo_file
 from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.libero.tasks import IN_SCENE, STEP_LIMITS, exceeds_step_limit, find_task, suites
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.planning.plan import twins
 from pipeline.run.outcome import FAILURE_REASONS
 from pipeline.run.replay_job import ReplayJob
@@ -170,7 +170,7 @@ class _FileJob:
 
     def _reached_at_start(self, entry: DemoEntry) -> str | None:
         """Return an error if the goal holds before the first action, which makes every replay a success."""
-        environment, demo = shared(self.task), HDF5Source(self.root).load(entry.demo_id)
+        environment, demo = environment_of(self.task), HDF5Source(self.root).load(entry.demo_id)
         assert demo.model_xml is not None, "HDF5 files have it"
         environment.restore(recorded_start(demo, demo.model_xml, settles=self.replay.settle_steps > 0))
         environment.settle(self.replay.settle_steps)

@@ -260,9 +260,9 @@ def _result() -> bytes:
 
 @cache
 def _model_xml() -> str:
-    from pipeline.physics.environment import shared
+    from pipeline.physics.environment import environment_of
 
-    return shared(STOVE).place_fixtures(0)
+    return environment_of(STOVE).place_fixtures(0)
 
 
 def _recording() -> bytes:
@@ -289,13 +289,13 @@ def _read_recording(file: Path) -> object:
 def _read_model(file: Path) -> object:
     """Read a model as a replay does: relocate it, compile it with MuJoCo, and step it."""
     from pipeline.errors import RejectedError
-    from pipeline.physics.environment import shared
+    from pipeline.physics.environment import environment_of
 
     try:
         text = file.read_text()
     except UnicodeDecodeError as error:
         raise PipelineError("not UTF-8", where=file) from error
-    environment = shared(STOVE)
+    environment = environment_of(STOVE)
     environment.restore(recorded_start(starter_demo(STOVE), relocate(text, str(file))))
     try:
         environment.step(np.zeros(7))

@@ -11,7 +11,7 @@ from pipeline.axes import PhysicsPerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
 from pipeline.physics.controller_goals import absolute_actions, replayed_grips, without_jumps
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.physics.replay import replay
 from pipeline.seeding import rng
 
@@ -27,7 +27,7 @@ def robot_start(component: str) -> PhysicsPerturbation:
 @pytest.mark.parametrize("component", ["", "controller_posture", "initial_joints"])
 def test_goals_are_those_of_robosuites_controller(component: str) -> None:
     """Also where the first actions do not turn the hand, and the controller keeps the posture of a changed reset."""
-    environment, demo = shared(STOVE), starter_demo(STOVE)
+    environment, demo = environment_of(STOVE), starter_demo(STOVE)
     begun = replace(demo, actions=demo.actions[:60])
     changes = (robot_start(component),) if component else ()
     trajectory = replay(environment, begun, "t", ReplayConfig(mode="open_loop"), changes)

@@ -22,7 +22,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.starts import NOOP_NORM, kept_actions
-from pipeline.physics.environment import Environment, shared
+from pipeline.physics.environment import Environment, environment_of
 from pipeline.physics.replay import judge, replay
 from pipeline.planning import plan
 from pipeline.run.replay_job import ReplayJob
@@ -109,7 +109,7 @@ def test_same_bytes_first_or_tenth_and_in_a_fresh_process(short_demos: Path) -> 
 
 
 def test_burner_does_not_stay_lit(short_demos: Path) -> None:
-    environment = shared(STOVE)
+    environment = environment_of(STOVE)
     first = replayed(short_demos, STOVE, environment)
     lit = first.site_alpha[-1] != first.site_alpha[0]
     assert lit.sum() == 1, "the burner is the one site whose opacity changes"
@@ -163,7 +163,9 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
     # Two pauses: at the start, where the gripper stays as it is, and on the way.
     actions[[0, 1, 5, 6], :6], actions[[0, 1, 5, 6], 6] = 0.0, actions[4, 6]
     demo = replace(demo, actions=actions)
-    trajectory = replay(shared(STOVE), demo, "t", ReplayConfig(noops=noops, settle_steps=3), (PathSeen(level=1),))
+    trajectory = replay(
+        environment_of(STOVE), demo, "t", ReplayConfig(noops=noops, settle_steps=3), (PathSeen(level=1),)
+    )
     assert len(trajectory.actions) == {"drop": 8, "trim_ends": 10, "keep": 12}[noops]
     assert np.array_equal(json.loads(trajectory.resolved)["path"], trajectory.states)
 

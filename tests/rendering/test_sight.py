@@ -8,7 +8,7 @@ from conftest import REPOSITORY, starter_demo
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.config import ReplayConfig
 from pipeline.evaluation import libero_plus
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import environment_of
 from pipeline.physics.replay import replay
 from pipeline.planning.streams import Stream
 from pipeline.rendering.renderer import LastScene
@@ -21,7 +21,7 @@ STUDY = TASKS["study"]
 @pytest.mark.slow
 def test_no_test_camera_of_the_study_loses_the_hand(opened: LastScene) -> None:
     """All 27 spherical ones lose it for up to 58 % of the steps; LIBERO's own for none."""
-    trajectory = replay(shared(STUDY), starter_demo(STUDY), "study", ReplayConfig(mode="open_loop"))
+    trajectory = replay(environment_of(STUDY), starter_demo(STUDY), "study", ReplayConfig(mode="open_loop"))
     renderer = opened.renderer(trajectory.model_xml)
     hand_m = []
     for state, alpha in zip(trajectory.states[:-1], trajectory.site_alpha[:-1], strict=True):

@@ -52,7 +52,7 @@ NO_TESTS = TestSet(())
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[preview.Stage]:
+def stage() -> Iterator[preview.StagedTask]:
     # Its task has something to move, so that all axes but goal apply.
     yield preview.staged([BOWL], STARTER)
     scene_of_process().close()
@@ -114,7 +114,7 @@ def tiles(sheet: Image.Image, views: int) -> list[Frame]:
 
 @pytest.mark.parametrize("name", AXES)
 def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_it_was(
-    stage: preview.Stage, name: str
+    stage: preview.StagedTask, name: str
 ) -> None:
     if not AXES[name]().applies(stage.demo.task):
         stage = preview.staged([COOKIES], STARTER)
@@ -135,7 +135,7 @@ def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_
 
 
 @pytest.mark.parametrize("name", ["camera", "noise", "language"])
-def test_variants_cover_components_and_levels(stage: preview.Stage, name: str) -> None:
+def test_variants_cover_components_and_levels(stage: preview.StagedTask, name: str) -> None:
     axis = preview.configured(name, STARTER)
     sampled = preview.variants(name, axis, stage.demo, 1, NO_TESTS)
     assert sampled == preview.variants(name, axis, stage.demo, 1, NO_TESTS)
@@ -176,16 +176,16 @@ def test_the_preview_of_a_combination_shows_the_plans_perturbations(monkeypatch:
 
 
 def test_a_sheet_of_a_combination_covers_its_components_and_changes_pictures_together(
-    stage: preview.Stage, monkeypatch: pytest.MonkeyPatch
+    stage: preview.StagedTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[tuple[Perturbation, ...]] = []
-    frames = preview.Stage.frames
+    frames = preview.StagedTask.frames
 
-    def recorded(self: preview.Stage, views: Any, *perturbations: Perturbation) -> list[Frame]:
+    def recorded(self: preview.StagedTask, views: Any, *perturbations: Perturbation) -> list[Frame]:
         shown.append(perturbations)
         return frames(self, views, *perturbations)
 
-    monkeypatch.setattr(preview.Stage, "frames", recorded)
+    monkeypatch.setattr(preview.StagedTask, "frames", recorded)
     sheet = preview.axis_sheet(stage, "light+noise", STARTER, NO_TESTS)
     nothing, *sampled = shown
     assert (nothing, len(sampled)) == ((), preview.VARIANTS)
@@ -209,7 +209,7 @@ def test_a_combination_without_anything_left_is_an_error() -> None:
         preview.axes_for("layout+language", config)
 
 
-def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sheet_of_both_views(stage: preview.StagedTask, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "configured", lambda name, config: StubAxis(kind=Dimming))
     original, *variants = tiles(preview.axis_sheet(stage, "dimming", STARTER, NO_TESTS), 2)
     # Two components at five levels are all that there is.
@@ -220,7 +220,9 @@ def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyP
     assert (variants[10] == 255).all()
 
 
-def test_perturbations_that_a_scene_rejects_are_grey(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_perturbations_that_a_scene_rejects_are_grey(
+    stage: preview.StagedTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(preview, "configured", lambda name, config: StubAxis(kind=Lift, levels=(1, 5)))
     monkeypatch.setattr(preview, "PHYSICS_VARIANTS", 4)
     captions: list[str] = []
@@ -244,14 +246,14 @@ def test_perturbations_that_a_scene_rejects_are_grey(stage: preview.Stage, monke
     assert np.array_equal(variants[0], variants[2])
 
 
-def test_the_original_is_the_same_after_a_state_with_a_lit_burner(stage: preview.Stage) -> None:
+def test_the_original_is_the_same_after_a_state_with_a_lit_burner(stage: preview.StagedTask) -> None:
     (before,) = stage.frames(["image"])
     renderer = stage.opened.renderer(stage.scene.model_xml)
     renderer.restore(stage.scene.state, np.full(renderer.model.nsite, 1.0, np.float32))
     np.testing.assert_array_equal(stage.frames(["image"])[0], before)
 
 
-def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
+def test_the_original_is_what_a_run_renders(stage: preview.StagedTask) -> None:
     environment = Environment(BOWL)
     environment.restore(stage.scene)
     environment.settle(10)
@@ -307,7 +309,7 @@ def test_the_command_shows_all_axes_next_to_the_twin(tmp_path: Path, monkeypatch
 
 
 def test_an_overview_shows_a_perturbation_of_a_middle_level_that_the_scene_accepts(
-    stage: preview.Stage, monkeypatch: pytest.MonkeyPatch
+    stage: preview.StagedTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preview, "configured", lambda name, config: StubAxis(kind=Lift, levels=(1, 5)))
     monkeypatch.setattr(preview, "PHYSICS_VARIANTS", 6)
