@@ -121,47 +121,21 @@ def render(
     """
     distances, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
-    owed = attributions(kept)
-    kept_suites = named(kept, "suite")
-    own_suites = [suite for suite in kept_suites if suite not in SUITES]
-    own_rewrites = _own_rewrites(kept)
-    libero = own_suites != kept_suites
-    licences = {credit.licence for credit in owed} - {*texture_sources.LICENCES.values()}
-    free = all(map(FREE.fullmatch, licences)) and not (own_suites or own_rewrites)
-    axes = _axes(kept, shown)
-    demos = {row["demo_id"] for row in kept}
-    facts = [EpisodeFacts(row["suite"], demo=row["demo_id"], origin=row["demo_origin_sha256"]) for row in kept]
+    axes, licence = _axes(kept, shown), _licence_facts(kept)
+    metadata = _metadata(shown, name, publish, free=licence["free"], libero=licence["libero"])
     return TEMPLATES.get_template("card.md.j2").render(
         line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
+        metadata=metadata.to_yaml(),
+        name=name,
+        publish=publish,
         shown=shown,
+        others=" and ".join(others),
         loading=shown.loading(name, REPOSITORY, kept),
         clients={client: call for client, call in clients.items() if client in shown.clients},
-        metadata=_metadata(shown, name, publish, free=free, libero=libero).to_yaml(),
-        publish=publish,
-        demos=demos,
-        held_out=demos_for_validation(facts, shown.options.validation),
-        others=" and ".join(others),
-        name=name,
-        kept=kept,
-        origins=origins(kept, source),
-        source=source,
-        libero=libero,
-        own_suites=own_suites,
-        own_rewrites=own_rewrites,
-        steps=sum(row["steps"] for row in kept),
-        rows=rows,
-        suites=named(rows, "suite"),
-        planned=named(tried(rows), "axis"),
-        counts=Counts.of,
-        targets=targets(rows, episodes),
-        levels=LEVELS,
-        diversity=diversity(kept),
-        total=Diversity.of(kept),
         axes=axes,
         sheets=sheets,
-        yields=_yields(rows),
-        distances={axis: finding for axis, finding in distances.items() if axis in axes},
         schema=SCHEMA,
+        distances={axis: finding for axis, finding in distances.items() if axis in axes},
         statistics=statistics,
         validation=validation,
         failed=[check for check, found in validation.items() if found["findings"]],
@@ -169,10 +143,57 @@ def render(
         example=min(row["episode_id"] for row in kept),
         versions=manifest.made_with(kept[0]),
         devices=sorted({row["gl_device"] for row in kept}),
-        free=free,
         citation=schema_file("citation.bib").read_text(),
-        owed=owed,
+        **licence,
+        **_demonstration_facts(kept, source, shown.options.validation),
+        **_count_facts(rows, kept, episodes),
     )
+
+
+def _licence_facts(kept: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the template's values about licences, third-party works and the user's own texts."""
+    owed = attributions(kept)
+    kept_suites = named(kept, "suite")
+    own_suites = [suite for suite in kept_suites if suite not in SUITES]
+    own_rewrites = _own_rewrites(kept)
+    licences = {credit.licence for credit in owed} - {*texture_sources.LICENCES.values()}
+    return {
+        "owed": owed,
+        "libero": own_suites != kept_suites,
+        "own_suites": own_suites,
+        "own_rewrites": own_rewrites,
+        "free": all(map(FREE.fullmatch, licences)) and not (own_suites or own_rewrites),
+    }
+
+
+def _demonstration_facts(kept: Sequence[Mapping[str, Any]], source: str, validation_share: float) -> dict[str, Any]:
+    """Return the template's values about the demonstrations behind the episodes."""
+    facts = [EpisodeFacts(row["suite"], demo=row["demo_id"], origin=row["demo_origin_sha256"]) for row in kept]
+    return {
+        "demos": {row["demo_id"] for row in kept},
+        "held_out": demos_for_validation(facts, validation_share),
+        "origins": origins(kept, source),
+        "source": source,
+    }
+
+
+def _count_facts(
+    rows: Sequence[Mapping[str, Any]], kept: Sequence[Mapping[str, Any]], episodes: Mapping[str, int]
+) -> dict[str, Any]:
+    """Return the template's values that count episodes."""
+    return {
+        "rows": rows,
+        "kept": kept,
+        "steps": sum(row["steps"] for row in kept),
+        "suites": named(rows, "suite"),
+        "planned": named(tried(rows), "axis"),
+        "counts": Counts.of,
+        "targets": targets(rows, episodes),
+        "levels": LEVELS,
+        "diversity": diversity(kept),
+        "total": Diversity.of(kept),
+        "yields": _yields(rows),
+    }
 
 
 def attributions(rows: Iterable[Mapping[str, Any]]) -> dict[Credit, int]:
