@@ -17,7 +17,7 @@ class Stream:
 
     Attributes:
         view: its name in ``schemas/episode.json``, such as ``image``.
-        perturbations: perturbations in the order they apply. ``streams_of`` lists only those that show in the view;
+        perturbations: perturbations in the order they apply. ``streams_of`` leaves out invisible ones;
             rendering ignores all others.
     """
 
