@@ -159,6 +159,35 @@ def _reject_edits(target: AnyFormat, record_file: Path) -> None:
         )
 
 
+def _reject_unknown(target: AnyFormat, work: Path) -> None:
+    """Stop before a file is replaced that no earlier export recorded, unless it has the content of the new file.
+
+    Such a file is the user's, or of a dataset whose record was deleted.
+
+    Args:
+        work: folder with the record of the finished dataset.
+
+    Raises:
+        PipelineError: naming the file, unless ``REMAKE=1`` allows it.
+    """
+    earlier: set[str] = set()
+    for record_file in (target.record_file, target.work / CHANGED / RECORD_FILE):
+        if record_file.is_file():
+            earlier |= DatasetRecord.from_json(read_json(record_file)).files.keys()
+    new = DatasetRecord.from_json(read_json(work / RECORD_FILE)).files
+    unknown: list[Path] = []
+    for file in _unrecorded(target.folder, earlier):
+        if checksum(file) != new.get(file.relative_to(target.folder).as_posix()):
+            unknown.append(file)
+    if unknown and os.environ.get(REMAKE) != "1":
+        raise PipelineError(
+            f"no record of an export lists the file, and it would be replaced ({len(unknown)} such files)",
+            where=unknown[0],
+            expected=f"only files that {target.record_file} lists",
+            remedy=f"move it to another place, and run the command again; or allow the replacement: {ALLOW}",
+        )
+
+
 def reject_unrecorded(folder: Path) -> None:
     """Stop before the folder of a format's datasets is deleted if it has files that no record of an export lists.
 
@@ -418,6 +447,7 @@ def _replace(target: AnyFormat, work: Path) -> None:
         foreign = _unrecorded(target.folder, recorded)
         if foreign:
             raise _foreign_entries_error(target, foreign, {name.partition("/")[0] for name in recorded})
+        _reject_unknown(target, work)
         for record_file in (target.record_file, target.work / CHANGED / RECORD_FILE):
             _reject_edits(target, record_file)
         if target.folder.exists():

@@ -223,6 +223,28 @@ def test_a_file_of_the_user_stays_where_the_record_is_lost(tmp_path: Path) -> No
     assert files(tmp_path) == expected
 
 
+@pytest.mark.parametrize("is_first", [True, False], ids=["before the first export", "after the record was deleted"])
+def test_a_file_with_the_name_of_a_file_to_write_stays(
+    is_first: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recording of the user has the name that LIBERO gives to it, which is that of our HDF5 file."""
+    written = tmp_path / "written"
+    command("rlds", written)
+    name = next(written.rglob("*.tfrecord*")).relative_to(written)
+    folder = tmp_path / "run"
+    if not is_first:
+        command("rlds", folder)
+        target("rlds", folder, "new").record_file.unlink()
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text("of the user")
+    with pytest.raises(PipelineError, match=rf"{name.name}.*no record of an export lists the file(?s:.*)REMAKE=1"):
+        command("rlds", folder)
+    assert (folder / name).read_text() == "of the user"
+    monkeypatch.setenv("REMAKE", "1")
+    command("rlds", folder)
+    assert files(folder) == files(written)
+
+
 def test_a_file_that_the_user_stores_during_an_export_stays(tmp_path: Path) -> None:
     command("rlds", tmp_path)
     note = next(tmp_path.rglob("dataset_info.json")).with_name("note.csv")
