@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
+from pipeline.axes.goal import GoalPerturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
@@ -243,8 +244,8 @@ def _labels(episode: StoredEpisode) -> list[Perturbation]:
 
 
 def _needs_task(perturbation: Perturbation) -> bool:
-    """Return whether the perturbation is compared only with the test tasks of one task or scene."""
-    return perturbation.same is not None
+    """Return whether the perturbation can be compared only if the task is known."""
+    return perturbation.same is not None or isinstance(perturbation, GoalPerturbation)
 
 
 def _of_another_suite(episode: StoredEpisode) -> bool:

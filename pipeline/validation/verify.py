@@ -15,7 +15,7 @@ from pipeline.formats.read_back import Written
 from pipeline.planning import plan
 from pipeline.run import manifest
 from pipeline.run.export import unrecorded_files
-from pipeline.run.layout import COUNTS, DATASETS, LEAKAGE, STATISTICS
+from pipeline.run.layout import COUNTS, DATASETS, LEAKAGE, STATISTICS, VALIDATION
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE, Store
 from pipeline.tables import read_table
@@ -45,9 +45,12 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
         results[name] = _verify_dataset(dataset, records.get(_record_of(dataset, run)), workers)
     for name in generated.FOLDERS:
         folder = run.path(name)
-        if folder.exists():
-            checked = sum(path.is_file() for path in folder.rglob("*"))
-            results[name] = {"checked": checked, "damaged": _unreadable(partial(generated.unchanged, folder))}
+        checked = sum(path.is_file() for path in folder.rglob("*"))
+        if checked:
+            damaged = _unreadable(partial(generated.unchanged, folder))
+        else:
+            damaged = [f"{folder}: the folder is missing or empty; `{MAKE_AGAIN}` generates it again"]
+        results[name] = {"checked": checked, "damaged": damaged}
     results["tables"] = _result(_unreadable(read) for read in _readers(run))
     if not any(result["damaged"] for result in results.values()):
         # A file and the table that lists it may both be gone; the plan still needs the file.
@@ -113,7 +116,7 @@ def _readers(run: Run) -> list[Callable[[], object]]:
         partial(plan.read, run.plan_file),
         partial(manifest.read, run.manifest_file),
     ]
-    names = [COUNTS, LEAKAGE, *([STATISTICS] if "rlds" in run.config.export.formats else [])]
+    names = [COUNTS, LEAKAGE, VALIDATION, *([STATISTICS] if "rlds" in run.config.export.formats else [])]
     if run.path(DATASETS).exists():
         names.append(DATASETS)
     return [*readers, *(partial(read_json, run.path(name)) for name in names)]

@@ -1,6 +1,7 @@
 """The HDF5 files have LIBERO's layout and the numbers that went in, whoever writes them, and damage is found."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -218,6 +219,28 @@ def test_validation_episodes_are_in_files_of_their_own(tmp_path: Path) -> None:
     assert list(target.check(rows, tmp_path)) == []
     copies = [target.read(rows[one]) for one in IDS]
     assert sorted(copy.train for copy in copies if copy) == [False, False, True, True, True, True]
+
+
+@pytest.mark.parametrize(("validation", "is_goal"), [(0.0, False), (0.34, False), (0.0, True)])
+def test_the_example_of_the_card_names_a_file_of_the_dataset(validation: float, is_goal: bool, tmp_path: Path) -> None:
+    """Also where all episodes are carried to another scene, and the card's first task has no file of its own."""
+    suite, task = "libero_object", "pick_up_the_bbq_sauce_and_place_it_in_the_basket"
+    scene = "pick_up_the_ketchup_and_place_it_in_the_basket"
+    goal = {"axis": "goal", "component": "other_scene", "level": 2, "scene": scene, "start": 3}
+    known: dict[str, EpisodeFacts] = {}
+    rows: list[dict[str, Any]] = []
+    for number, one in enumerate(IDS):
+        demo = f"{suite}/{task}/demo_{number}"
+        source = episode(one)
+        known[one] = EpisodeFacts(suite, one, demo, source.instruction, len(source), scene=scene if is_goal else "")
+        perturbations = json.dumps([goal] if is_goal else [])
+        rows.append({"suite": suite, "task": task, "perturbations": perturbations})
+        rows[-1] |= {"demo_id": demo, "demo_origin_sha256": ""}
+    target = Hdf5(tmp_path, Hdf5Config(name=NAME, validation=validation))
+    export(target, Episodes(known, episode), loop)
+    (named,) = re.findall(r"/hdf5/(.*hdf5)", target.loading(NAME, "me/one", rows).partition("```python")[2])
+    assert named in files(target.folder)
+    assert ("__in__" in named) == is_goal
 
 
 def row(episode_id: str, source: Callable[[str], Episode] = episode) -> dict[str, Any]:

@@ -229,14 +229,15 @@ def test_an_episode_without_a_text_and_one_of_an_unknown_suite_are_counted(
     (provenance,) = edited.rglob("provenance.parquet")
     listed = pq.read_table(provenance).to_pylist()
     moved = {"axis": "pose", "component": "scene", "level": 1, "moves": [{"name": "bowl_1", "dx_m": 0.01, "dy_m": 0}]}
+    goal = {"axis": "goal", "component": "other_scene", "level": 2, "scene": "put_the_cup_away", "start": 3}
     for row in listed:
         if row["episode_id"] == LABELLED:
             row["suite"] = "my_kitchen"
-            row["perturbations"] = json.dumps([moved, *json.loads(row["perturbations"])])
+            row["perturbations"] = json.dumps([goal, moved, *json.loads(row["perturbations"])])
     write_table(pa.Table.from_pylist(listed), provenance)
     found = audit(edited, test)
     assert (found.episodes, found.without_instruction, found.without_task) == (6, 1, 1)
-    assert found.unknown == {"language": 1, "pose": 1}
+    assert found.unknown == {"goal": 1, "language": 1, "pose": 1}
     # The noise of the unknown suite's episode is the same in every task, and still found.
     assert {axis: one.closest for axis, one in found.axes.items() if one.overlaps} == {
         "camera": CAMERA, "language": WORDS, "noise": LABELLED,

@@ -71,7 +71,21 @@ def test_check_finds_edits_and_additions(path: str, part: str, told: str, finish
     assert not any(result["damaged"] for result in results.values())
 
 
-@pytest.mark.parametrize("name", ["plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json"])
+@pytest.mark.parametrize("name", ["finetune", "card"])
+def test_check_finds_a_deleted_folder(name: str, finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    shutil.rmtree(data / name)
+    with chdir(tmp_path):
+        results = verify(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
+    (told,) = results.pop(name)["damaged"]
+    assert "is missing or empty" in told
+    assert not any(result["damaged"] for result in results.values())
+
+
+@pytest.mark.parametrize(
+    "name", ["plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "validation.json"]
+)
 def test_check_finds_a_deleted_table(name: str, finished: Path, tmp_path: Path) -> None:
     data = tmp_path / "data" / "tiny"
     shutil.copytree(finished, data)

@@ -6,9 +6,10 @@ from typing import Any, ClassVar
 
 import pyarrow as pa
 
+from pipeline.axes import task_of
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content
 from pipeline.formats.base import Format, FormatOptions, Name, Row, StepSizes, ValidationShare
-from pipeline.formats.episodes import Episodes, Load, Piece
+from pipeline.formats.episodes import EpisodeFacts, Episodes, Load, Piece, demos_for_validation
 from pipeline.formats.hdf5 import layout
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.grouping import grouped
@@ -97,7 +98,14 @@ class Hdf5(Format[Hdf5Config]):
         return read.read(self.folder, row["episode_id"], self.content)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
-        first = min(f"{row['suite']}/{row['task']}" for row in kept)
+        facts: list[EpisodeFacts] = []
+        for row in kept:
+            task = task_of(row["suite"], row["task"], row["perturbations"])
+            scene = task.bddl_file.stem if task.goal_file else ""
+            origin = row["demo_origin_sha256"]
+            facts.append(EpisodeFacts(row["suite"], demo=row["demo_id"], origin=origin, scene=scene))
+        held_out = demos_for_validation(facts, self.options.validation)
+        first = min(layout.file_of(one.played, "train") for one in facts if one.demo not in held_out)
         return f"""\
 The files `hdf5/<suite>/<task>_demo.hdf5` have the layout of LIBERO's own demonstrations:
 
@@ -111,7 +119,7 @@ import os
 
 import h5py
 
-with h5py.File(f"{{os.environ['DATA']}}/hdf5/{first}_demo.hdf5") as file:
+with h5py.File(f"{{os.environ['DATA']}}/hdf5/{first}") as file:
     for episode in file["data"].values():
         image, action = episode["obs/agentview_rgb"], episode["actions"]
         text = episode.attrs["instruction"]
