@@ -83,9 +83,9 @@ DISTRIBUTION = "perturbed-libero"
 REMAKE = "REMAKE"
 """Environment variable that permits a command, as ``REMAKE=1`` before it, to generate finished work again.
 
-It also permits to delete finished work that a changed plan no longer needs, to replace edited files of a dataset, and
-to replace demonstrations of an earlier ``demos expand``. Edited folders ``card`` and ``finetune`` are kept under
-another name.
+It also permits to delete finished work that a changed plan no longer needs, to replace edited files of a dataset and
+files that no record lists, and to replace demonstrations of an earlier ``demos expand``. Edited folders ``card`` and
+``finetune`` are kept under another name.
 """
 
 VERSIONS = {

@@ -67,7 +67,7 @@ class Stage:
             shard behind the record of its dataset; `None` if all of them are unchanged.
         memory: function that returns the memory of the last call, if it does not follow from settings, inputs and
             outputs.
-        always: function that is called at the end, also if the outputs were up to date.
+        unchanged: function that is called in place of ``work`` if the outputs are up to date.
     """
 
     work: Callable[[Run], None]
@@ -76,7 +76,7 @@ class Stage:
     outputs: Sequence[str] = ()
     changed_file: Callable[[Run], Path | None] | None = None
     memory: Callable[[Run], Memory] | None = None
-    always: Callable[[Run], None] | None = None
+    unchanged: Callable[[Run], None] | None = None
 
 
 def write_inputs(run: Run) -> None:
@@ -254,7 +254,7 @@ def validate(run: Run) -> None:
 
 
 def date_validation(run: Run) -> None:
-    """Give the report of ``validate`` the present date: `push` requires checks no older than the checked files."""
+    """Give the report of unchanged files the present date: `push` requires checks no older than the checked files."""
     run.validation_file.touch()
 
 
@@ -271,7 +271,7 @@ def write_recipe(run: Run) -> None:
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
 
 
-def render_sheets(run: Run) -> None:
+def summarize(run: Run) -> None:
     """Render contact sheets, of the run and of one task per suite, and print the run's counts."""
     from pipeline.report import preview, sheets
 
@@ -281,6 +281,7 @@ def render_sheets(run: Run) -> None:
         with run.workers(renders=True) as workers:
             preview.for_run(run.config, run.path(PREVIEWS), workers)
         previews.keep()
+    print_counts(run)
 
 
 def print_counts(run: Run) -> None:
@@ -305,6 +306,7 @@ def write_report(run: Run) -> None:
     from pipeline.report import report
 
     write(run.report_file, report.page(run, benchmark.load()))
+    name_report(run)
 
 
 def name_report(run: Run) -> None:
@@ -347,11 +349,11 @@ STAGES = {
     ),
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
     "manifest": Stage(write_manifest, _LABELLED, (INPUTS, *_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
-    "validate": Stage(validate, memory=finished.validate_memory, always=date_validation),
+    "validate": Stage(validate, memory=finished.validate_memory, unchanged=date_validation),
     "recipe": Stage(write_recipe, ("export", "finetune"), (MANIFEST, *_RECORDS), (FINETUNE,)),
-    "summary": Stage(render_sheets, memory=finished.summary_memory, always=print_counts),
+    "summary": Stage(summarize, memory=finished.summary_memory, unchanged=print_counts),
     "card": Stage(write_card, inputs.PUBLISHED, (MANIFEST, *REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
-    "report": Stage(write_report, memory=finished.report_memory, always=name_report),
+    "report": Stage(write_report, memory=finished.report_memory, unchanged=name_report),
 }
 """Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""
 
@@ -373,7 +375,7 @@ def run_all(file: Path) -> Run:
 
 
 def perform(name: str, run: Run, title: str = "") -> None:
-    """Perform a stage, unless its inputs and outputs are unchanged since the last call; then call its ``always``.
+    """Perform a stage, unless its inputs and outputs are unchanged since the last call.
 
     Args:
         title: printed first; the name by default.
@@ -384,17 +386,17 @@ def perform(name: str, run: Run, title: str = "") -> None:
     stage, reason = STAGES[name], why_not(name, run)
     if reason is None:
         print(f"{title or name}: up to date", flush=True)
-    else:
-        print(title or name, flush=True)
-        if reason not in (EVERY_TIME, finished.NO_RECORD):
-            print(f"  reason: {reason}", flush=True)
-        reject_foreign_files(run.folder)
-        stage.work(run)
-        after = _memory(name, Run(run.config))
-        if after is not None:
-            after.keep()
-    if stage.always is not None:
-        stage.always(run)
+        if stage.unchanged is not None:
+            stage.unchanged(run)
+        return
+    print(title or name, flush=True)
+    if reason not in (EVERY_TIME, finished.NO_RECORD):
+        print(f"  reason: {reason}", flush=True)
+    reject_foreign_files(run.folder)
+    stage.work(run)
+    after = _memory(name, Run(run.config))
+    if after is not None:
+        after.keep()
 
 
 def why_not(name: str, run: Run) -> str | None:

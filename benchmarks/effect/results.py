@@ -34,6 +34,11 @@ class PolicyResults:
     reading: Sequence[dict[str, Any]]
     black: Sequence[dict[str, Any]] = ()
 
+    @property
+    def precision(self) -> str:
+        """Precision of the training; all results that do not state it have ``bfloat16``."""
+        return str(self.made.get("trained_with", {}).get("precision", "bfloat16"))
+
     def made_by(self) -> dict[str, Any]:
         """Return the settings and versions that compared policies must share."""
         versions: dict[str, Any] = {}
@@ -90,6 +95,14 @@ def read(folder: Path) -> list[PolicyResults]:
         rows = [EpisodeResult(**common, **dict(zip(columns, row, strict=True))) for row in content.pop("rows")]
         policies.append(PolicyResults(**content, rows=rows))
         _reject_different(policies[0], policies[-1], policies[0].made_by(), file)
+        same_seed = next(policy for policy in policies if policy.seed == policies[-1].seed)
+        if policies[-1].precision != same_seed.precision:
+            raise PipelineError(
+                f"{policies[-1].arm} was trained in {policies[-1].precision}, and {same_seed.arm} in "
+                f"{same_seed.precision}, under the same seed",
+                where=file,
+                remedy="train both on processors of one kind",
+            )
     if not policies:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")
     settings = policies[0].settings

@@ -62,6 +62,11 @@ def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
     for one in written:
         one.write(tmp_path)
     assert results.read(tmp_path) == written
+    in_float32 = replace(written[0], arm="ours", made={"trained_with": {"precision": "float32"}})
+    in_float32.write(tmp_path)
+    with pytest.raises(PipelineError, match="ours was trained in float32, and clean in bfloat16, under the same seed"):
+        results.read(tmp_path)
+    (tmp_path / "ours_seed0.json").unlink()
     others: dict[str, dict[str, Any]] = {
         "settings": {"settings": {"frame_px": 32}},
         "packages": {"made": {"packages": {"torch": "1.0"}}},
@@ -249,6 +254,11 @@ def test_the_summary_has_the_differences_of_the_committed_rows() -> None:
                 compared += 1
     assert compared == 28
     assert perturbed[1:] == ["212", "212", "128", "128", "128", "32", "32"]
+    # Holm's p of these cells: 0.014 and below 0.01; 0.15, 0.12 and 0.25.
+    cells = {line[0]: dict(zip(head, line, strict=True)) for line in lines}
+    assert (cells["noise"]["`all`"], cells["robot"]["`all`"]) == ("**+31**", "**+33**")
+    assert (cells["robot"]["`ours`"], cells["LIBERO's own"]["the same, twice the steps"]) == ("+15", "-18")
+    assert cells["noise"]["the same, twice the steps"] == "+28"
 
 
 def test_the_plot_of_the_page_is_the_same_each_time(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from sentences import SIZE, Vectors, vector
 from states import relative_by_episode
 from torchvision.ops.misc import FrozenBatchNorm2d
 
+from pipeline.errors import PipelineError
 from pipeline.files import remove, replaced
 from pipeline.run.finished import host
 from pipeline.seeding import rng
@@ -83,6 +84,12 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
         policy.load_state_dict(saved["policy"])
         optimizer.load_state_dict(saved["optimizer"])
         step, log = saved["step"], saved["log"]
+        if saved["precision"] != precision():
+            raise PipelineError(
+                f"the training began in {saved['precision']}, and this processor continues in {precision()}",
+                where=work,
+                remedy="resume on a processor of the first kind, or move the folder away to begin again",
+            )
     policy.train()
     losses: list[float] = []
     wall, cpu = time.perf_counter(), time.process_time()
@@ -108,7 +115,13 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
         if step % config.save_every == 0 or step == config.steps:
             with replaced(work / "last.pt") as temporary:
                 torch.save(
-                    {"policy": policy.state_dict(), "optimizer": optimizer.state_dict(), "step": step, "log": log},
+                    {
+                        "policy": policy.state_dict(),
+                        "optimizer": optimizer.state_dict(),
+                        "step": step,
+                        "log": log,
+                        "precision": precision(),
+                    },
                     temporary,
                 )
     with replaced(out) as folder:

@@ -101,9 +101,9 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     }
     write_json(evaluation.folder / "summary.json", summarised)
     # Other calls have written results of other tasks; equal settings are those of this call's results. A call without
-    # any result does not know them, and leaves the table as it is.
-    if rows:
-        in_folder = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]
+    # any result does not know them, and leaves a table of the policy as it is.
+    in_folder = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]
+    if rows or not in_folder:
         evaluation.files.write_table(row for row in in_folder if row.settings == rows[0].settings)
     if faults:
         raise _without_result([*faults.items()])

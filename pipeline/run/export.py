@@ -109,16 +109,21 @@ def reject_foreign(target: AnyFormat, episodes: Episodes) -> None:
 
 
 def _recorded(target: AnyFormat) -> set[str]:
-    """Return the paths of a dataset's files in all records: empty if there is none.
-
-    Records in the work folder are of killed calls, and of datasets with missing or changed files.
-    """
+    """Return the paths of the files that exports have put into a dataset's folder: empty without any record."""
     recorded: set[str] = set()
-    for file in target.work.glob(f"*/{RECORD_FILE}"):
+    for file in _records_in(target.work):
         recorded |= DatasetRecord.from_json(read_json(file)).files.keys()
     with suppress(PipelineError):  # The dataset has no record, or has changed since.
         recorded |= target.record().files.keys()
     return recorded
+
+
+def _records_in(work: Path) -> list[Path]:
+    """List the records in a format's work folder of datasets that are in place: killed calls, and changed datasets.
+
+    The record of a dataset that is still in the work folder says nothing about the files that it would replace.
+    """
+    return [file for file in work.glob(f"*/{RECORD_FILE}") if not (file.parent / "dataset").is_dir()]
 
 
 def _foreign_entries_error(target: AnyFormat, foreign: Sequence[Path], sets: Collection[str]) -> PipelineError:
@@ -160,7 +165,7 @@ def _reject_edits(target: AnyFormat, record_file: Path) -> None:
 
 
 def _reject_unknown(target: AnyFormat, work: Path) -> None:
-    """Stop before a file is replaced that no earlier export recorded, unless it has the content of the new file.
+    """Stop before a file is lost that no earlier export recorded, unless it has the content of the new one.
 
     Such a file is the user's, or of a dataset whose record was deleted.
 
@@ -168,21 +173,24 @@ def _reject_unknown(target: AnyFormat, work: Path) -> None:
         work: folder with the record of the finished dataset.
 
     Raises:
-        PipelineError: naming the file, unless ``REMAKE=1`` allows it.
+        PipelineError: naming the file. ``REMAKE=1`` allows the replacement of a file that the new dataset has, too.
     """
-    earlier: set[str] = set()
-    for record_file in (target.record_file, target.work / CHANGED / RECORD_FILE):
-        if record_file.is_file():
-            earlier |= DatasetRecord.from_json(read_json(record_file)).files.keys()
+    recorded = _recorded(target)
     new = DatasetRecord.from_json(read_json(work / RECORD_FILE)).files
-    unknown: list[Path] = []
-    for file in _unrecorded(target.folder, earlier):
-        if checksum(file) != new.get(file.relative_to(target.folder).as_posix()):
-            unknown.append(file)
-    if unknown and os.environ.get(REMAKE) != "1":
+    foreign: list[Path] = []
+    replaced_files: list[Path] = []
+    for file in _unrecorded(target.folder, recorded):
+        sha256 = new.get(file.relative_to(target.folder).as_posix())
+        if sha256 is None:
+            foreign.append(file)
+        elif not file.is_file() or checksum(file) != sha256:
+            replaced_files.append(file)
+    if foreign:
+        raise _foreign_entries_error(target, foreign, {name.partition("/")[0] for name in (*recorded, *new)})
+    if replaced_files and os.environ.get(REMAKE) != "1":
         raise PipelineError(
-            f"no record of an export lists the file, and it would be replaced ({len(unknown)} such files)",
-            where=unknown[0],
+            f"no record of an export lists the file, and it would be replaced ({len(replaced_files)} such files)",
+            where=replaced_files[0],
             expected=f"only files that {target.record_file} lists",
             remedy=f"move it to another place, and run the command again; or allow the replacement: {ALLOW}",
         )
@@ -197,8 +205,7 @@ def reject_unrecorded(folder: Path) -> None:
         PipelineError: naming such a file, or the record if it is damaged.
     """
     record_file = folder.with_name(f"{folder.name}.json")
-    # Records in the work folder are of killed calls, and of datasets with missing or changed files.
-    further_records = (folder.parent / WORK / folder.name).glob(f"*/{RECORD_FILE}")
+    further_records = _records_in(folder.parent / WORK / folder.name)
     recorded: set[str] = set()
     for file in (record_file, *further_records):
         if file.is_file():
@@ -361,6 +368,7 @@ def notice_changes(target: AnyFormat) -> None:
     Raises:
         PipelineError: when the record is unreadable, because edited files would not be found without it.
     """
+    _finish_replacement(target)
     put_away = target.work / CHANGED / RECORD_FILE
     if not target.record_file.exists() and put_away.is_file():
         os.replace(put_away, target.record_file)
@@ -443,10 +451,6 @@ def _replace(target: AnyFormat, work: Path) -> None:
     """
     if (work / "dataset").is_dir():
         # The user may have stored or edited files since the export began. An edit may keep size and time of a file.
-        recorded = _recorded(target)
-        foreign = _unrecorded(target.folder, recorded)
-        if foreign:
-            raise _foreign_entries_error(target, foreign, {name.partition("/")[0] for name in recorded})
         _reject_unknown(target, work)
         for record_file in (target.record_file, target.work / CHANGED / RECORD_FILE):
             _reject_edits(target, record_file)
@@ -454,9 +458,27 @@ def _replace(target: AnyFormat, work: Path) -> None:
             os.replace(target.folder, target.work / BEFORE)
         target.record_file.unlink(missing_ok=True)  # This record is of the earlier dataset.
         put_in_place(work / "dataset", target.folder)
+    _put_record(target, work)
+
+
+def _put_record(target: AnyFormat, work: Path) -> None:
+    """Put the record of the dataset in place next to it, and delete the work folder."""
     (work / RECORD_FILE).touch()  # No file of the dataset is younger than its record.
     put_in_place(work / RECORD_FILE, target.record_file)
     _clear_work(target)
+
+
+def _finish_replacement(target: AnyFormat) -> None:
+    """Put the record of a dataset in place if the export was killed between the dataset and its record.
+
+    Another dataset may be wanted now, and only this record tells that the files are no user's.
+    """
+    if target.record_file.exists() or not target.folder.exists():
+        return
+    for record_file in _records_in(target.work):
+        if record_file.parent.name != CHANGED:
+            _put_record(target, record_file.parent)
+            return
 
 
 def _write_pieces(target: AnyFormat, work: Path, pieces: Sequence[Piece], load: Load, workers: Workers) -> None:

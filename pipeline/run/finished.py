@@ -1,6 +1,7 @@
 """Memory of stages with few outputs: skip a stage if its inputs and recipe have not changed since its last call.
 
-The memory is a file of ``data/<run>/.finished/``. To have a stage work again, delete its output.
+The memory is a file of ``data/<run>/.finished/``. To have a stage work again, delete its output, and a
+dataset together with its record.
 """
 
 import json

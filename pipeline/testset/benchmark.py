@@ -99,7 +99,7 @@ class TestSet:
 
 @cache
 def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
-    """Group the indices of an axis's test tasks by the ``shared`` key of the task that they perturb."""
+    """Group the indices of an axis's test tasks by the ``common_key`` of the task that they perturb."""
     bases = [find_task(test_task.suite, test_task.base) for test_task in test.on_axis(axis)]
     return grouped((common_key(task, same), place) for place, task in enumerate(bases))
 

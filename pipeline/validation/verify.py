@@ -15,14 +15,14 @@ from pipeline.formats.read_back import Written
 from pipeline.planning import plan
 from pipeline.run import manifest
 from pipeline.run.export import unrecorded_files
-from pipeline.run.layout import COUNTS, DATASETS, LEAKAGE, STATISTICS, VALIDATION
+from pipeline.run.layout import COUNTS, DATASETS, LEAKAGE, STATISTICS
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE, Store
 from pipeline.tables import read_table
 
 
 def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
-    """Read every stored file of a run: trajectories, frames, the datasets, the generated folders and the tables.
+    """Read every stored file of a finished run: trajectories, frames, datasets, tables and generated folders.
 
     Files that no record lists count as damage, too: a client may read them.
 
@@ -43,6 +43,11 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
     for dataset in (*run.formats, *_failure_formats(run, records)):
         name = dataset.folder.relative_to(run.folder).as_posix()
         results[name] = _verify_dataset(dataset, records.get(_record_of(dataset, run)), workers)
+    results["tables"] = _result(_unreadable(read) for read in _readers(run))
+    if not any(result["damaged"] for result in results.values()):
+        # A file and the table that lists it may both be gone; the plan still needs the file.
+        results["episodes"] = _result([_unreadable(lambda: run.outcome)])
+    results["validation"] = _result([_unreadable(partial(read_json, run.validation_file))])
     for name in generated.FOLDERS:
         folder = run.path(name)
         checked = sum(path.is_file() for path in folder.rglob("*"))
@@ -51,10 +56,6 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
         else:
             damaged = [f"{folder}: the folder is missing or empty; `{MAKE_AGAIN}` generates it again"]
         results[name] = {"checked": checked, "damaged": damaged}
-    results["tables"] = _result(_unreadable(read) for read in _readers(run))
-    if not any(result["damaged"] for result in results.values()):
-        # A file and the table that lists it may both be gone; the plan still needs the file.
-        results["episodes"] = _result([_unreadable(lambda: run.outcome)])
     return results
 
 
@@ -116,7 +117,7 @@ def _readers(run: Run) -> list[Callable[[], object]]:
         partial(plan.read, run.plan_file),
         partial(manifest.read, run.manifest_file),
     ]
-    names = [COUNTS, LEAKAGE, VALIDATION, *([STATISTICS] if "rlds" in run.config.export.formats else [])]
+    names = [COUNTS, LEAKAGE, *([STATISTICS] if "rlds" in run.config.export.formats else [])]
     if run.path(DATASETS).exists():
         names.append(DATASETS)
     return [*readers, *(partial(read_json, run.path(name)) for name in names)]

@@ -24,7 +24,7 @@ from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobot
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run import cleaning
 from pipeline.run.claim import OWNER
-from pipeline.run.export import _bring_up_to_date, notice_changes
+from pipeline.run.export import _bring_up_to_date, notice_changes, reject_unrecorded
 from pipeline.run.run import Run
 from pipeline.types import Episode
 
@@ -237,12 +237,49 @@ def test_a_file_with_the_name_of_a_file_to_write_stays(
         target("rlds", folder, "new").record_file.unlink()
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text("of the user")
-    with pytest.raises(PipelineError, match=rf"{name.name}.*no record of an export lists the file(?s:.*)REMAKE=1"):
-        command("rlds", folder)
+    for _ in range(2):
+        with pytest.raises(PipelineError, match=rf"{name.name}.*no record of an export lists the file(?s:.*)REMAKE=1"):
+            command("rlds", folder)
+    with pytest.raises(PipelineError, match="no record of an export lists the file, and it would be deleted"):
+        reject_unrecorded(folder / "rlds")
     assert (folder / name).read_text() == "of the user"
     monkeypatch.setenv("REMAKE", "1")
     command("rlds", folder)
     assert files(folder) == files(written)
+
+
+@pytest.mark.parametrize("is_dangling", [True, False])
+def test_a_link_with_the_name_of_a_file_to_write_is_named(is_dangling: bool, tmp_path: Path) -> None:
+    written, folder, elsewhere = tmp_path / "written", tmp_path / "run", tmp_path / "elsewhere"
+    command("rlds", written)
+    name = next(written.rglob("*.tfrecord*")).relative_to(written)
+    (folder / name).parent.mkdir(parents=True)
+    if not is_dangling:
+        elsewhere.mkdir()
+    (folder / name).symlink_to(elsewhere)
+    with pytest.raises(PipelineError, match=rf"{name.name}.*no record of an export lists the file"):
+        command("rlds", folder)
+    assert (folder / name).is_symlink()
+
+
+def test_a_file_of_the_user_stays_when_a_run_returns_to_its_finished_dataset(tmp_path: Path) -> None:
+    """The export of another name stops because of the file; the first name is asked for again."""
+    command("rlds", tmp_path)
+    first, second = target("rlds", tmp_path, "new"), target("rlds", tmp_path, "second")
+    written = tmp_path / "written"
+    _bring_up_to_date(target("rlds", written, "second"), episodes(), RUN)
+    theirs = tmp_path / next(written.rglob("*.tfrecord*")).relative_to(written)
+
+    def load(episode_id: str) -> Episode:
+        theirs.parent.mkdir(parents=True, exist_ok=True)
+        theirs.write_text("of the user")
+        return episode(episode_id)
+
+    with pytest.raises(PipelineError, match="no record of an export lists the file"):
+        _bring_up_to_date(second, episodes(load), RUN)
+    with pytest.raises(PipelineError, match="is not of this run's RLDS"):
+        _bring_up_to_date(first, episodes(), RUN)
+    assert theirs.read_text() == "of the user"
 
 
 def test_a_file_that_the_user_stores_during_an_export_stays(tmp_path: Path) -> None:
@@ -296,10 +333,25 @@ def killed_before(change: int, name: str, data: Path) -> None:
     command(name, data)
 
 
+def other_actions(episode_id: str) -> Episode:
+    source = episode(episode_id)
+    return replace(source, action=source.action / 2)
+
+
+def other_command(name: str, data: Path) -> None:
+    """The same with episodes of other actions, under the same names."""
+    notice_changes(target(name, data, "new"))
+    _bring_up_to_date(target(name, data, "new"), episodes(other_actions, "second"), RUN)
+
+
 def kill_everywhere(name: str, folder: Path) -> None:
-    """In a process of its own: print how many kills there were, and what the same command then came to."""
+    """In a process of its own: print how many kills there were, and what a command then came to.
+
+    The command is the same one, and for RLDS also one with other episodes.
+    """
     expected, before, prepared = (folder / part for part in ("expected", "before", "prepared"))
     command(name, expected)
+    other_command(name, folder / "other")
     _bring_up_to_date(target(name, before, "old"), episodes(), RUN)
     shutil.copytree(before, prepared)
     killed = in_a_fork(lambda: killed_before(1, name, prepared))
@@ -310,6 +362,12 @@ def kill_everywhere(name: str, folder: Path) -> None:
         data = folder / str(kills)
         shutil.copytree(prepared, data)
         killed = in_a_fork(lambda: killed_before(kills, name, data))  # noqa: B023 - called at once
+        if name == "rlds":
+            other_data = shutil.copytree(data, folder / f"{kills}_other")
+            if in_a_fork(lambda: other_command(name, other_data)):  # noqa: B023 - called at once
+                faults.append(f"{kills}: other episodes are rejected")
+            elif files(other_data) != files(folder / "other"):
+                faults.append(f"{kills}: other episodes differ")
         if in_a_fork(lambda: command(name, data)):  # noqa: B023 - called at once
             faults.append(f"{kills}: rejected")
         elif files(data) != files(expected):

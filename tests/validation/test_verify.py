@@ -83,9 +83,19 @@ def test_check_finds_a_deleted_folder(name: str, finished: Path, tmp_path: Path)
     assert not any(result["damaged"] for result in results.values())
 
 
-@pytest.mark.parametrize(
-    "name", ["plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "validation.json"]
-)
+def test_check_finds_a_deleted_report_of_the_checks(finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    (data / "validation.json").unlink()
+    with chdir(tmp_path):
+        results = verify(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
+    (told,) = results.pop("validation")["damaged"]
+    assert "validation.json: the file is missing" in told
+    assert "episodes" in results
+    assert not any(result["damaged"] for result in results.values())
+
+
+@pytest.mark.parametrize("name", ["plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json"])
 def test_check_finds_a_deleted_table(name: str, finished: Path, tmp_path: Path) -> None:
     data = tmp_path / "data" / "tiny"
     shutil.copytree(finished, data)
