@@ -83,8 +83,8 @@ DISTRIBUTION = "perturbed-libero"
 REMAKE = "REMAKE"
 """Environment variable that permits a command, as ``REMAKE=1`` before it, to generate finished work again.
 
-It also permits to delete finished work that a changed plan no longer needs, to replace edited files of a dataset and
-files that no record lists, and to replace demonstrations of an earlier ``demos expand``. Edited folders ``card`` and
+It also permits to delete finished work that a changed plan no longer needs. It permits to replace edited files of a
+dataset, files that no record lists, and demonstrations of an earlier ``demos expand``. Edited folders ``card`` and
 ``finetune`` are kept under another name.
 """
 

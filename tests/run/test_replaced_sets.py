@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from conftest import run_in
 from synthetic import episode, episodes, files
@@ -335,7 +336,7 @@ def killed_before(change: int, name: str, data: Path) -> None:
 
 def other_actions(episode_id: str) -> Episode:
     source = episode(episode_id)
-    return replace(source, action=source.action / 2)
+    return replace(source, action=source.action * np.float32(0.5))
 
 
 def other_command(name: str, data: Path) -> None:
