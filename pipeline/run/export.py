@@ -121,7 +121,7 @@ def _recorded(target: AnyFormat) -> set[str]:
 def _records_in(work: Path) -> list[Path]:
     """List the records in a format's work folder of datasets that are in place: killed calls, and changed datasets.
 
-    A dataset that is still in the work folder is not in place: its record lists none of the files that it would replace.
+    A dataset that is still in the work folder is left out: its record lists none of the files that it would replace.
     """
     return [file for file in work.glob(f"*/{RECORD_FILE}") if not (file.parent / "dataset").is_dir()]
 
