@@ -226,7 +226,8 @@ def test_the_summary_has_the_differences_of_the_committed_rows() -> None:
     folders = {"`all`": "axes", "`released`": "axes", "`ours`": "no_state", "`all`, four scenes": "object"}
     folders |= {"`robots`": "starts", "`poses`": "starts", "the same, twice the steps": "object_long"}
     arms = {"`released`": "released", "`ours`": "ours", "`robots`": "robots", "`poses`": "poses"}
-    head, _, seeds, perturbed, *lines = [line.strip("| ").split(" | ") for line in comparison.summary().splitlines()]
+    table_lines = comparison.summary().splitlines()
+    head, _, seeds, perturbed, *lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table_lines]
 
     def successes(folder: str, arm: str) -> pd.DataFrame:
         tables: list[pd.DataFrame] = []
