@@ -52,7 +52,10 @@ class DemosConfig(Frozen):
     source: Literal["starter", "hdf5"] = "starter"
     root: Place | None = None
     tasks: Annotated[tuple[str, ...], Field(min_length=1)] = (
-        *("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*"),
+        "libero_spatial/*",
+        "libero_object/*",
+        "libero_goal/*",
+        "libero_10/*",
     )
     per_task: Count | None = None
 

@@ -87,7 +87,8 @@ def _counts(
     for head in ("wanted", "planned", "reach their goal", "rendered"):
         table.add_column(head, justify="right", no_wrap=True)
     views, every = config.render.content.views, []
-    for axis in (*(["clean"] if rows else []), *config.plan.episodes):
+    axes = ["clean", *config.plan.episodes] if rows else config.plan.episodes
+    for axis in axes:
         of_axis = [row for row in rows if row.axis == axis]
         kept = [row for row in of_axis if judged[row.episode_id].kept]
         planned = sum(row.wanted for row in of_axis)

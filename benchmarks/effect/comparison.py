@@ -322,12 +322,13 @@ def _difference_rows(results: Sequence[PolicyResults]) -> list[list[str]]:
 
 
 def summary() -> str:
-    """Return a table of the differences between arms of all further experiments and clean data."""
+    """Return a table of the differences between the arms of ``SUMMARIZED`` and clean data."""
     seeds, perturbed = ["*seeds*"], ["*perturbed episodes in each scene*"]
     cells: dict[str, dict[str, str]] = defaultdict(dict)
     for column, (experiment, arm) in SUMMARIZED.items():
-        clean = [policy for policy in _of_further(experiment) if policy.arm == "clean"]
-        policies = [policy for policy in _of_further(experiment) if policy.arm == arm]
+        results = _of_further(experiment)
+        clean = [policy for policy in results if policy.arm == "clean"]
+        policies = [policy for policy in results if policy.arm == arm]
         seeds.append(str(len({policy.seed for policy in policies} & {policy.seed for policy in clean})))
         episodes = policies[0].made["episodes_by_axis"]
         scenes = {row["scene"] for row in _readings(policies, arm)}

@@ -226,8 +226,10 @@ def test_the_summary_has_the_differences_of_the_committed_rows() -> None:
     folders = {"`all`": "axes", "`released`": "axes", "`ours`": "no_state", "`all`, four scenes": "object"}
     folders |= {"`robots`": "starts", "`poses`": "starts", "the same, twice the steps": "object_long"}
     arms = {"`released`": "released", "`ours`": "ours", "`robots`": "robots", "`poses`": "poses"}
-    table_lines = comparison.summary().splitlines()
-    head, _, seeds, perturbed, *lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table_lines]
+    rows: list[list[str]] = []
+    for line in comparison.summary().splitlines():
+        rows.append([cell.strip() for cell in line.split("|")[1:-1]])
+    head, _, seeds, perturbed, *lines = rows
 
     def successes(folder: str, arm: str) -> pd.DataFrame:
         tables: list[pd.DataFrame] = []
@@ -243,23 +245,23 @@ def test_the_summary_has_the_differences_of_the_committed_rows() -> None:
         ours, clean = successes(folder, arm), successes("no_state" if folder == "starts" else folder, "clean")
         common = set(ours["trained_with_seed"]) & set(clean["trained_with_seed"])
         assert int(seeds[place]) == len(common)
-        for line in lines:
-            axis = {"LIBERO's own": "clean"}.get(line[0], line[0])
+        for cells in lines:
+            axis = {"LIBERO's own": "clean"}.get(cells[0], cells[0])
             if axis in ("clean", "robot", "language", "pose"):
                 rates: list[float] = []
                 for table in (clean, ours):
                     chosen = table[(table["axis"] == axis) & table["trained_with_seed"].isin(common)]
                     rates.append(chosen["success"].mean())
-                points = float(line[place].strip("*"))
-                assert points == pytest.approx(100 * (rates[1] - rates[0]), abs=0.501), (line[0], column)
+                points = float(cells[place].strip("*"))
+                assert points == pytest.approx(100 * (rates[1] - rates[0]), abs=0.501), (cells[0], column)
                 compared += 1
     assert compared == 28
     assert perturbed[1:] == ["212", "212", "128", "128", "128", "32", "32"]
     # Holm's p of these cells: 0.014 and below 0.01; 0.15, 0.12 and 0.25.
-    cells = {line[0]: dict(zip(head, line, strict=True)) for line in lines}
-    assert (cells["noise"]["`all`"], cells["robot"]["`all`"]) == ("**+31**", "**+33**")
-    assert (cells["robot"]["`ours`"], cells["LIBERO's own"]["the same, twice the steps"]) == ("+15", "-18")
-    assert cells["noise"]["the same, twice the steps"] == "+28"
+    shown = {cells[0]: dict(zip(head, cells, strict=True)) for cells in lines}
+    assert (shown["noise"]["`all`"], shown["robot"]["`all`"]) == ("**+31**", "**+33**")
+    assert (shown["robot"]["`ours`"], shown["LIBERO's own"]["the same, twice the steps"]) == ("+15", "-18")
+    assert shown["noise"]["the same, twice the steps"] == "+28"
 
 
 def test_the_plot_of_the_page_is_the_same_each_time(tmp_path: Path) -> None:

@@ -192,7 +192,7 @@ def _reject_unknown(target: AnyFormat, work: Path) -> None:
             f"no record of an export lists the file, and it would be replaced ({len(replaced_files)} such files)",
             where=replaced_files[0],
             expected=f"only files that {target.record_file} lists",
-            remedy=f"move it to another place, and run the command again; or allow the replacement: {ALLOW}",
+            remedy="move it to another place, and run the command again",
         )
 
 
