@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from hashlib import file_digest
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -209,6 +210,12 @@ def _discard(temporary: Path) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
     else:
         temporary.unlink(missing_ok=True)
+
+
+def unused_name(path: Path, kind: str) -> Path:
+    """Return the first of ``<path>.<kind>_1``, ``<path>.<kind>_2`` and so on that does not exist."""
+    names = (path.with_name(f"{path.name}.{kind}_{number}") for number in count(1))
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def remove_if_empty(folder: Path) -> None:

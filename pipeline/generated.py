@@ -7,12 +7,11 @@ import os
 import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
-from pipeline.files import checksum, read_json, remove, replaced, write_json
+from pipeline.files import checksum, read_json, remove, replaced, unused_name, write_json
 from pipeline.identity import ALLOW, REMAKE
 from pipeline.record import Basis, Record
 
@@ -49,7 +48,7 @@ def generated(
         lost = _lost_edits(folder, files)
         if lost:
             # The permission may have been given for other work.
-            old = _free_name(folder)
+            old = unused_name(folder, "edited")
             print(f"generated {folder} again; the edited files {in_words(lost)} are now in {old}")
         record = {"files": files, "made_from": dict(made_from or {}), "settings": dict(settings or {})}
         write_json(unfinished / RECORD, record)
@@ -57,12 +56,6 @@ def generated(
             os.replace(folder, old)
     if not lost:
         remove(old)
-
-
-def _free_name(folder: Path) -> Path:
-    """Return the first unused name for the earlier content of a folder."""
-    names = (folder.with_name(f"{folder.name}.edited_{number}") for number in count(1))
-    return next(path for path in names if not path.exists())
 
 
 def read_record(folder: Path) -> Record:

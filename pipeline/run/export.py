@@ -29,6 +29,7 @@ from pipeline.files import (
     remove_if_empty,
     replaced,
     sync,
+    unused_name,
     write_json,
 )
 from pipeline.formats.base import AnyFormat, DatasetRecord
@@ -76,7 +77,7 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     reject_foreign(target, episodes)
     reject_changed(target)
     if not episodes.ids and "outcome" in target.content.extras:
-        _reject_edits(target, target.record_file)
+        _set_aside(target, _edits_to_replace(target, target.record_file))
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
         print(f"no replay missed its goal, so {target.folder} was not written")
@@ -142,13 +143,17 @@ def reject_changed(target: AnyFormat) -> None:
     Raises:
         PipelineError: naming the file, unless ``REMAKE=1`` allows it.
     """
-    _reject_edits(target, target.work / CHANGED / RECORD_FILE)
+    _edits_to_replace(target, target.work / CHANGED / RECORD_FILE)
 
 
-def _reject_edits(target: AnyFormat, record_file: Path) -> None:
-    """Compare the content of every file of a dataset with a record, if it exists, as ``reject_changed`` describes."""
+def _edits_to_replace(target: AnyFormat, record_file: Path) -> list[Path]:
+    """Return the files of a dataset whose content differs from a record: none if the record does not exist.
+
+    Raises:
+        PipelineError: naming such a file, unless ``REMAKE=1`` allows the replacement.
+    """
     if not record_file.is_file():
-        return
+        return []
     recorded = DatasetRecord.from_json(read_json(record_file)).files
     changed: list[Path] = []
     for name, sha256 in recorded.items():
@@ -160,12 +165,13 @@ def _reject_edits(target: AnyFormat, record_file: Path) -> None:
             f"the file was edited or damaged, and would be replaced ({len(changed)} such files)",
             where=changed[0],
             expected=f"the content that {record_file} lists",
-            remedy=f"move it to another place, and it is generated again; or allow the change: {ALLOW}",
+            remedy=f"move it to another place, and it is generated again; or let the export move it: {ALLOW}",
         )
+    return changed
 
 
-def _reject_unknown(target: AnyFormat, work: Path) -> None:
-    """Stop before a file is lost that no earlier export recorded, unless it has the content of the new one.
+def _unknown_to_replace(target: AnyFormat, work: Path) -> list[Path]:
+    """Return the files that no earlier export recorded, and that the new dataset has with other content.
 
     Such a file is the user's, or of a dataset whose record was deleted.
 
@@ -173,7 +179,8 @@ def _reject_unknown(target: AnyFormat, work: Path) -> None:
         work: folder with the record of the finished dataset.
 
     Raises:
-        PipelineError: naming the file. ``REMAKE=1`` allows the replacement of a file that the new dataset has, too.
+        PipelineError: naming such a file, unless ``REMAKE=1`` allows the replacement; or naming an unrecorded file that
+            the new dataset does not have.
     """
     recorded = _recorded(target)
     new = DatasetRecord.from_json(read_json(work / RECORD_FILE)).files
@@ -192,8 +199,24 @@ def _reject_unknown(target: AnyFormat, work: Path) -> None:
             f"no record of an export lists the file, and it would be replaced ({len(replaced_files)} such files)",
             where=replaced_files[0],
             expected=f"only files that {target.record_file} lists",
-            remedy="move it to another place, and run the command again",
+            remedy=f"move it to another place, and run the command again; or let the export move it: {ALLOW}",
         )
+    return replaced_files
+
+
+def _set_aside(target: AnyFormat, files: Collection[Path]) -> None:
+    """Move a user's files out of a dataset's folder, into ``<folder>.edited_<number>``.
+
+    The permission to replace them may have been given for other work, so they are not deleted.
+    """
+    if not files:
+        return
+    aside = unused_name(target.folder, "edited")
+    for file in files:
+        place = aside / file.relative_to(target.folder)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(file, place)
+    print(f"{len(files)} files of {target.folder} that no export wrote are now in {aside}")
 
 
 def reject_unrecorded(folder: Path) -> None:
@@ -451,9 +474,10 @@ def _replace(target: AnyFormat, work: Path) -> None:
     """
     if (work / "dataset").is_dir():
         # The user may have stored or edited files since the export began. An edit may keep size and time of a file.
-        _reject_unknown(target, work)
+        to_keep = {*_unknown_to_replace(target, work)}
         for record_file in (target.record_file, target.work / CHANGED / RECORD_FILE):
-            _reject_edits(target, record_file)
+            to_keep |= {*_edits_to_replace(target, record_file)}
+        _set_aside(target, to_keep)
         if target.folder.exists():
             os.replace(target.folder, target.work / BEFORE)
         target.record_file.unlink(missing_ok=True)  # This record is of the earlier dataset.

@@ -50,6 +50,11 @@ def command(name: str, data: Path) -> None:
     _bring_up_to_date(target(name, data, "new"), episodes(), RUN)
 
 
+def aside(edited: Path, data: Path) -> str:
+    """Where a file of the RLDS data set is kept, below the run's folder, once its replacement is allowed."""
+    return str(Path("rlds.edited_1") / edited.relative_to(data / "rlds"))
+
+
 @pytest.mark.parametrize("name", ["rlds", "lerobot"])
 @pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_bytes(b"rot")], ids=["missing", "changed"])
 def test_a_file_of_the_user_stays_where_a_damaged_dataset_is_generated_again(
@@ -93,7 +98,7 @@ def test_an_edited_file_is_replaced_only_where_that_is_allowed(
     edited.write_bytes(edit)
     monkeypatch.setenv("REMAKE", "1")
     command("rlds", tmp_path)
-    assert files(tmp_path) == expected
+    assert files(tmp_path) == {**expected, aside(edited, tmp_path): edit}
 
 
 @pytest.mark.parametrize("content", ["first", "second"], ids=["the same dataset", "another dataset"])
@@ -124,6 +129,7 @@ def test_an_edit_that_keeps_size_and_time_stops_the_replacement(
     monkeypatch.setenv("REMAKE", "1")
     _bring_up_to_date(export_target, episodes(content="second"), RUN)
     assert edited.read_bytes() == original
+    assert (tmp_path / aside(edited, tmp_path)).read_bytes() == mine
     assert not export_target.work.exists()
 
 
@@ -145,7 +151,10 @@ def test_a_file_that_the_user_edits_during_an_export_stays(tmp_path: Path) -> No
     assert not export_target.work.exists()
 
 
-def test_failures_that_no_longer_exist_are_not_deleted_with_an_edit(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_allowed", [True, False])
+def test_failures_that_no_longer_exist_are_not_deleted_with_an_edit(
+    is_allowed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     content = Content(extras=("outcome",))
     failures = Rlds(tmp_path, RldsConfig(name="new", shards=2), content)
     lost: dict[str, Any] = {"success": False, "reason": "goal_lost"}
@@ -162,9 +171,13 @@ def test_failures_that_no_longer_exist_are_not_deleted_with_an_edit(tmp_path: Pa
     none = Episodes({}, load)
     with pytest.raises(PipelineError, match=r"dataset_info\.json: the file was edited or damaged"):
         _bring_up_to_date(failures, none, RUN)
-    edited.write_bytes(original)
+    if is_allowed:
+        monkeypatch.setenv("REMAKE", "1")
+    else:
+        edited.write_bytes(original)
     _bring_up_to_date(failures, none, RUN)
     assert not failures.folder.exists()
+    assert files(tmp_path) == ({aside(edited, tmp_path): original[::-1]} if is_allowed else {})
 
 
 def test_cleaning_unfinished_files_keeps_the_record_of_an_edited_dataset(tmp_path: Path) -> None:
@@ -241,13 +254,15 @@ def test_a_file_with_the_name_of_a_file_to_write_stays(
     for _ in range(2):
         with pytest.raises(PipelineError, match=rf"{name.name}.*no record of an export lists the file") as caught:
             command("rlds", folder)
-        assert caught.value.remedy == "move it to another place, and run the command again", "no loss is advised"
+        assert str(caught.value.remedy).startswith("move it to another place, and run the command again; or let ")
     with pytest.raises(PipelineError, match="no record of an export lists the file, and it would be deleted"):
         reject_unrecorded(folder / "rlds")
     assert (folder / name).read_text() == "of the user"
     monkeypatch.setenv("REMAKE", "1")
     command("rlds", folder)
-    assert files(folder) == files(written)
+    kept = {path: content for path, content in files(folder).items() if path.startswith("rlds.edited_1/")}
+    assert kept[aside(folder / name, folder)] == b"of the user"
+    assert files(folder) == files(written) | kept
 
 
 @pytest.mark.parametrize("is_dangling", [True, False])
