@@ -6,8 +6,14 @@ from pydantic import Field, model_validator
 
 from pipeline.types import Count, Frozen
 
+USUAL_GB = 3.5
+"""Memory of a worker process in usual runs: 2.5 GB in ``validate`` of the default run, and more in larger runs."""
+
 LARGEST_GB = 4.6
-"""Largest measured memory of a worker process, in ``validate`` of 1,004 episodes of all 40 tasks (docs/cost.md)."""
+"""Largest measured memory of a worker process.
+
+An earlier version needed it in ``validate`` of 1,004 episodes of all 40 tasks (docs/cost.md).
+"""
 
 JOB_GB = round(4 / 3 * LARGEST_GB)
 """Memory of a SLURM job, a third above ``LARGEST_GB``. SLURM ends a job that takes more."""

@@ -200,9 +200,14 @@ class Content:
         return tuple(name for name in MAPS if name in self.extras)
 
     @property
+    def is_of_failures(self) -> bool:
+        """Return whether the episodes missed their goal."""
+        return "outcome" in self.extras
+
+    @property
     def provenance(self) -> dict[str, str]:
         """Map the names of the provenance columns to their types."""
-        outcome = OUTCOME if "outcome" in self.extras else {}
+        outcome = OUTCOME if self.is_of_failures else {}
         return {**SCHEMA.provenance, **outcome}
 
     @property

@@ -60,8 +60,11 @@ def in_shell(variables: Mapping[str, str]) -> str:
 @cache
 def machine_code() -> str:
     """Return the kernels of OpenBLAS and NumPy in this process, such as ``Haswell AVX2``."""
-    features = import_module("numpy._core._multiarray_umath").__cpu_features__
-    widest = next((name for name in ("AVX512_SKX", "AVX512F", "AVX2", "AVX") if features.get(name)), "baseline")
+    # Imported after ``ensure_fixed_machine_code``, as NumPy reads the variables when it is loaded.
+    numpy = import_module("numpy")
+    extensions = numpy.show_config(mode="dicts")["SIMD Extensions"]
+    used = {*extensions["baseline"], *extensions.get("found", ())}
+    widest = next((name for name in ("AVX512_SKX", "AVX512F", "AVX2", "AVX") if name in used), "baseline")
     return f"{_openblas_kernel()} {widest}"
 
 

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import yaml
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from pipeline import templates
 from pipeline.clients.files import LEROBOT_TRAIN, OFT_SCRIPT, OPENPI_ASSETS, RECIPE, ROBOMIMIC_CONFIG, STARVLA_CONFIG
 from pipeline.episode_schema import SCHEMA, STANDARD, Content
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
+from pipeline.formats.base import AnyFormat
 from pipeline.formats.hdf5 import Hdf5
 from pipeline.formats.lerobot import LeRobot, LeRobotOpenpi, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds
@@ -29,21 +30,14 @@ TEMPLATES = Path(__file__).parent / "templates"
 OPENPI = "pi05_libero"
 """openpi's configuration for training and serving."""
 
-EXPORTS = {
-    "openvla_oft": "export: {rlds: {}}",
-    "vla_adapter": "export: {rlds: {}}",
-    "lerobot_act": "export: {lerobot: {}}",
-    "lerobot_smolvla": "export: {lerobot: {}}",
-    "lerobot_pi05": "export: {lerobot: {}}",
-    "lerobot_pi0_fast": "export: {lerobot: {}}",
-    "lerobot_molmoact2": "export: {lerobot: {}}",
-    "starvla": "export: {lerobot_v21: {convention: ipec}}",
-    "gr00t": "export: {lerobot_v21: {convention: ipec}}",
-    "openpi": "export: {lerobot_openpi: {}}",
-    "openpi_serve": "export: {lerobot_openpi: {}}",
-    "robomimic": "export: {hdf5: {}}",
-}
-"""Client to the setting of a run's configuration that exports the format that it reads."""
+EXPORTS: tuple[tuple[type[AnyFormat], dict[str, str]], ...] = (
+    (Rlds, {}),
+    (LeRobot, {}),
+    (LeRobotV21, {"convention": "ipec"}),
+    (LeRobotOpenpi, {}),
+    (Hdf5, {}),
+)
+"""Formats that clients read, with the options that they need."""
 
 MANIFEST = "manifest.parquet of this run"
 
@@ -133,8 +127,18 @@ def _training_and_clients(
     values |= {"robomimic_config": ROBOMIMIC_CONFIG}
     values |= {"ipec_set": _v21_of(export, "ipec"), "openpi_set": _v21_of(export, "openpi")}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **values))
-    missing = {client: setting for client, setting in EXPORTS.items() if client not in sections["clients"]}
+    missing = {client: setting for client, setting in _setting_of_client().items() if client not in sections["clients"]}
     return {**sections, "clients_of_other_formats": missing} if missing else sections
+
+
+def _setting_of_client() -> dict[str, str]:
+    """Map each client to the setting of a run's configuration that exports the format that it reads."""
+    settings: dict[str, str] = {}
+    for kind, options in EXPORTS:
+        in_yaml = ", ".join(f"{name}: {value}" for name, value in options.items())
+        dataset = kind(Path(), kind.options_type.model_validate(options))
+        settings |= dict.fromkeys(dataset.clients, f"export: {{{kind.name}: {{{in_yaml}}}}}")
+    return settings
 
 
 def _evaluated_inputs(export: ExportConfig, content: Content) -> str:
@@ -165,14 +169,7 @@ def _v21_of(export: ExportConfig, convention: str) -> tuple[str, str] | None:
 
 def _filled(template: str, **values: object) -> str:
     """Render a Jinja template of this package."""
-    environment = Environment(
-        loader=PackageLoader("pipeline.clients"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template(template).render(**values)
+    return templates.environment("pipeline.clients").get_template(template).render(**values)
 
 
 def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, datasets: Mapping[str, Path]) -> None:

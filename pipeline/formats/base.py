@@ -123,6 +123,27 @@ class StepSizes(NamedTuple):
     motion_kb: float
 
 
+@dataclass(frozen=True)
+class CardFacts:
+    """Facts about the storage of a dataset for its card.
+
+    Attributes:
+        held_out_place: end of the card's sentence on the episodes for validation, in Markdown.
+        turns_frames: true if frames are rotated by 180 degrees from LIBERO's raw frames, as in an ``Episode``.
+        maps_stored_as: form of depth and segmentation, in words.
+        flattens_matrices: true if matrices are stored row by row, without their shape.
+        has_language_column: true if every frame has lerobot's language column.
+        has_depth_video: true if depth is a video in lerobot's own codes.
+    """
+
+    held_out_place: str
+    turns_frames: bool = True
+    maps_stored_as: str = "PNG"
+    flattens_matrices: bool = False
+    has_language_column: bool = False
+    has_depth_video: bool = False
+
+
 class Format(ABC, Generic[Options]):
     """A format's dataset of one run.
 
@@ -147,14 +168,6 @@ class Format(ABC, Generic[Options]):
     """Name of the format that is written by the same stage, ``export_<group>``; most often the format's own name."""
     stores_replay: ClassVar[bool] = False
     """True if the format stores the states and the scene of each episode's replay."""
-    turns_frames: ClassVar[bool] = True
-    """True if frames are rotated by 180 degrees from LIBERO's raw frames, as in an ``Episode``."""
-    maps_stored_as: ClassVar[str] = "PNG"
-    """Form of depth and segmentation, in words."""
-    flattens_matrices: ClassVar[bool] = False
-    """True if matrices are stored row by row, without their shape."""
-    held_out_place: ClassVar[str]
-    """End of the card's sentence on the episodes for validation, in Markdown."""
     splits_each_suite: ClassVar[bool] = False
     """True if a client that validates needs the split ``val`` of every suite, instead of one of all suites."""
     step_s: float
@@ -171,6 +184,8 @@ class Format(ABC, Generic[Options]):
     """The clients of ``finetune.yaml`` that train on this format."""
     gripper: GripperSpec = SCHEMA.action.gripper
     """The commands of the gripper in this format."""
+    card_facts: CardFacts
+    """Facts about the storage, for the dataset card."""
 
     def __init__(self, data: Path, options: Options, content: Content = STANDARD) -> None:
         self.data = data
@@ -191,16 +206,6 @@ class Format(ABC, Generic[Options]):
     def root(self) -> Path:
         """Return the folder that a client opens."""
         return self.folder
-
-    @property
-    def language(self) -> bool:
-        """Return whether every frame has lerobot's language column."""
-        return False
-
-    @property
-    def depth_as_video(self) -> bool:
-        """Return whether depth is a video in lerobot's own codes."""
-        return False
 
     @property
     def record_file(self) -> Path:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import pyarrow as pa
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, STANDARD, Content
-from pipeline.formats.base import Format, FormatOptions, Name, Row, StepSizes, ValidationShare
+from pipeline.formats.base import CardFacts, Format, FormatOptions, Name, Row, StepSizes, ValidationShare
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, dataset_of, shard_path
@@ -53,7 +53,7 @@ class Rlds(Format[RldsConfig]):
     recipe: ClassVar = 9
     packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
     splits_each_suite: ClassVar = True  # OpenVLA-OFT, when it validates, reads the split val of each set.
-    held_out_place: ClassVar = "are the split `val` of each set that has this split."
+    card_facts = CardFacts(held_out_place="are the split `val` of each set that has this split.")
     group: ClassVar = "rlds"
     step_s = 0.0004
     columns: ClassVar = (

@@ -73,7 +73,7 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], content: Content) 
 
 def texts(content: Content) -> dict[str, str]:
     """Return the texts of ``dataset_info.json`` for people."""
-    kept, end = ("miss the goal", "failure") if "outcome" in content.extras else ("solve the task", "success")
+    kept, end = ("miss the goal", "failure") if content.is_of_failures else ("solve the task", "success")
     return {
         "description": f"LIBERO demonstrations, perturbed, replayed in simulation and kept when they {kept}. "
         f"Robot: Franka Panda. Every episode ends in {end}; episode_metadata says what was changed.",
@@ -103,7 +103,7 @@ def features(content: Content) -> Any:
     if "object_poses" in content.extras:
         observation["object_poses"] = _tensor(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
-    failures = "outcome" in content.extras
+    failures = content.is_of_failures
     step = {
         "observation": observation,
         "action": _tensor(SCHEMA.action),

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-import jinja2
 import yaml
 from huggingface_hub import DatasetCardData
 
+from pipeline import templates
 from pipeline.axes import from_json, task_of
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
@@ -40,15 +40,6 @@ REPOSITORY = "OWNER/NAME"
 
 FREE = re.compile(r"MIT|Apache-2\.0|BSD-[23]-Clause|CC0-1\.0|CC-BY-\d\.\d(-US)?", re.IGNORECASE)
 """SPDX identifiers of the licences under which a derived work may be CC BY 4.0."""
-
-
-TEMPLATES = jinja2.Environment(
-    loader=jinja2.PackageLoader("pipeline.publish"),
-    undefined=jinja2.StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-    keep_trailing_newline=True,
-)
 
 
 def write(run: Run) -> None:
@@ -123,30 +114,34 @@ def render(
     kept = [row for row in rows if row["kept"]]
     axes, licence = _axes(kept, shown), _licence_facts(kept)
     metadata = _metadata(shown, name, publish, free=licence["free"], libero=licence["libero"])
-    return TEMPLATES.get_template("card.md.j2").render(
-        line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
-        metadata=metadata.to_yaml(),
-        name=name,
-        publish=publish,
-        shown=shown,
-        others=" and ".join(others),
-        loading=shown.loading(name, REPOSITORY, kept),
-        clients={client: call for client, call in clients.items() if client in shown.clients},
-        axes=axes,
-        sheets=sheets,
-        schema=SCHEMA,
-        distances={axis: finding for axis, finding in distances.items() if axis in axes},
-        statistics=statistics,
-        validation=validation,
-        failed=[check for check, found in validation.items() if found["findings"]],
-        # With a kept episode as the example, readers of the dataset can run the command unchanged.
-        example=min(row["episode_id"] for row in kept),
-        versions=manifest.made_with(kept[0]),
-        devices=sorted({row["gl_device"] for row in kept}),
-        citation=schema_file("citation.bib").read_text(),
-        **licence,
-        **_demonstration_facts(kept, source, shown.options.validation),
-        **_count_facts(rows, kept, episodes),
+    return (
+        templates.environment("pipeline.publish")
+        .get_template("card.md.j2")
+        .render(
+            line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
+            metadata=metadata.to_yaml(),
+            name=name,
+            publish=publish,
+            shown=shown,
+            others=" and ".join(others),
+            loading=shown.loading(name, REPOSITORY, kept),
+            clients={client: call for client, call in clients.items() if client in shown.clients},
+            axes=axes,
+            sheets=sheets,
+            schema=SCHEMA,
+            distances={axis: finding for axis, finding in distances.items() if axis in axes},
+            statistics=statistics,
+            validation=validation,
+            failed=[check for check, found in validation.items() if found["findings"]],
+            # With a kept episode as the example, readers of the dataset can run the command unchanged.
+            example=min(row["episode_id"] for row in kept),
+            versions=manifest.made_with(kept[0]),
+            devices=sorted({row["gl_device"] for row in kept}),
+            citation=schema_file("citation.bib").read_text(),
+            **licence,
+            **_demonstration_facts(kept, source, shown.options.validation),
+            **_count_facts(rows, kept, episodes),
+        )
     )
 
 

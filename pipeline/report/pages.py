@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
+from pipeline import templates
 from pipeline.images.jpeg import decode
 from pipeline.images.mp4 import mp4
 from pipeline.report import figures
@@ -23,16 +23,10 @@ PICTURE_PX, PICTURE_QUALITY = 1100, 80
 
 def render(template: str, **values: Any) -> str:
     """Render a page; values are escaped, and a name without a value is an error."""
-    environment = Environment(
-        loader=PackageLoader("pipeline.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals["colour"] = figures.colour
-    environment.filters["counted"] = counted
-    return environment.get_template(template).render(**values)
+    pages = templates.environment("pipeline.report", escapes_html=True)
+    pages.globals["colour"] = figures.colour
+    pages.filters["counted"] = counted
+    return pages.get_template(template).render(**values)
 
 
 def counted(number: int, one: str, several: str = "") -> str:

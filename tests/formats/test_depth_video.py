@@ -212,7 +212,7 @@ def test_without_the_option_depth_is_text(tmp_path: Path) -> None:
     plain = LeRobot(tmp_path, LeRobotConfig(name=NAME), CONTENT)
     assert "depth" not in plain.options.model_dump()
     assert plain.keys["image_depth"] == "camera.agent.depth"
-    assert not plain.depth_as_video
+    assert not plain.card_facts.has_depth_video
 
 
 CONFIG = (

@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from pipeline.axes import task_of
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content
-from pipeline.formats.base import Format, FormatOptions, Name, Row, StepSizes, ValidationShare
+from pipeline.formats.base import CardFacts, Format, FormatOptions, Name, Row, StepSizes, ValidationShare
 from pipeline.formats.episodes import EpisodeFacts, Episodes, Load, Piece, demos_for_validation
 from pipeline.formats.hdf5 import layout
 from pipeline.formats.read_back import Copy, Fault
@@ -46,9 +46,9 @@ class Hdf5(Format[Hdf5Config]):
     # The attribute ``episode_id`` of each demonstration joins it with the manifest, which needs no columns.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
     stores_replay: ClassVar = True
-    turns_frames: ClassVar = False
-    held_out_place: ClassVar = "are in files of their own, below `hdf5/val/`."
-    maps_stored_as: ClassVar = "array"
+    card_facts = CardFacts(
+        held_out_place="are in files of their own, below `hdf5/val/`.", turns_frames=False, maps_stored_as="array"
+    )
     clients = ("robomimic",)
 
     def __init__(self, data: Path, options: Hdf5Config, content: Content = STANDARD) -> None:

@@ -12,7 +12,7 @@ from packaging.version import Version
 from pydantic import Field, field_validator
 
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
-from pipeline.formats.base import Format, FormatOptions, Name, Row, StepSizes, ValidationShare
+from pipeline.formats.base import CardFacts, Format, FormatOptions, Name, Row, StepSizes, ValidationShare
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, number_pieces, split
 from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, VIEW_AS_VIDEO_KB, Action, Depth, Layout
 from pipeline.formats.read_back import Copy, Fault
@@ -129,12 +129,6 @@ class LeRobot(Format[LeRobotConfig]):
     by_default: ClassVar = True
     recipe: ClassVar = 16
     packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
-    held_out_place: ClassVar = (
-        "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless "
-        "`--dataset.episodes` leaves them out."
-    )
-    maps_stored_as: ClassVar = MAPS_STORED_AS
-    flattens_matrices: ClassVar = True
     group: ClassVar = "lerobot"
     step_s = 0.0015
     columns: ClassVar = (
@@ -155,15 +149,17 @@ class LeRobot(Format[LeRobotConfig]):
         if self.layout.convention.open_is_one:
             self.gripper = OPEN_IS_ONE
         self.clients = CLIENTS_V30[options.convention]
+        self.card_facts = CardFacts(
+            held_out_place=(
+                "come last, as the split `val` of `meta/info.json`. lerobot-train trains on them too, unless "
+                "`--dataset.episodes` leaves them out."
+            ),
+            maps_stored_as=MAPS_STORED_AS,
+            flattens_matrices=True,
+            has_language_column=options.language,
+            has_depth_video=bool(self.layout.depth_videos),
+        )
         self.step_s += DEPTH_MAP_S * content.area * len(self.layout.depth_videos)
-
-    @property
-    def language(self) -> bool:
-        return self.options.language
-
-    @property
-    def depth_as_video(self) -> bool:
-        return bool(self.layout.depth_videos)
 
     @property
     def root(self) -> Path:
@@ -200,7 +196,7 @@ class LeRobot(Format[LeRobotConfig]):
         maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in text_maps)
         images_kb = 40.0 if self.options.frames == "images" else 0.0
         data_kb = 0.5 + views * (maps_kb + images_kb)
-        view_kb = DEPTH_MAP_KB if self.depth_as_video else VIEW_AS_VIDEO_KB
+        view_kb = DEPTH_MAP_KB if self.layout.depth_videos else VIEW_AS_VIDEO_KB
         return int(1000 * FILE_MB / max(data_kb, view_kb * self.content.area))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
@@ -313,9 +309,11 @@ class LeRobotV21(Format[LeRobotV21Config]):
     options_type: ClassVar[type[LeRobotV21Config]] = LeRobotV21Config
     recipe: ClassVar = 8
     packages: ClassVar = ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
-    held_out_place: ClassVar = "are separate sets, whose names end in `_val`."
-    maps_stored_as: ClassVar = MAPS_STORED_AS
-    flattens_matrices: ClassVar = True
+    card_facts = CardFacts(
+        held_out_place="are separate sets, whose names end in `_val`.",
+        maps_stored_as=MAPS_STORED_AS,
+        flattens_matrices=True,
+    )
     group: ClassVar = LeRobot.group
     step_s = LeRobot.step_s
     # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.

@@ -278,7 +278,7 @@ class Layout:
             columns |= {camera_column(view, "boxes"): _flat(SCHEMA.boxes) for view in self.content.views}
         if "object_poses" in self.content.extras:
             columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
-        if "outcome" in self.content.extras:
+        if self.content.is_of_failures:
             columns[IS_SUCCESS] = {"dtype": "bool", "shape": (1,), "names": None}
         if self.language:
             columns |= {name: {"dtype": "language", "shape": (1,), "names": None} for name in (LANGUAGE, EVENTS)}

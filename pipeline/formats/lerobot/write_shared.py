@@ -157,7 +157,7 @@ def step_columns(episode: Episode, numbers: Numbers, layout: Layout) -> dict[str
             stored[name] = pa.array(values)
         else:
             stored[name] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
-    if "outcome" in layout.content.extras:
+    if layout.content.is_of_failures:
         stored[IS_SUCCESS] = pa.array([episode.provenance["success"]] * len(episode))
     columns = stored | {name: pa.array(values) for name, values in texts.items()} | images
     return {layout.name(name): values for name, values in columns.items()}
