@@ -106,7 +106,11 @@ class ObjectModel:
                 f'<mujoco><asset>{assets}</asset><worldbody><body name="object">{geoms}</body></worldbody></mujoco>'
             )
         except ValueError as error:
-            raise PipelineError(f"MuJoCo cannot use the model ({error})", where=self.mjcf) from error
+            raise PipelineError(
+                f"MuJoCo cannot use the model ({error})",
+                where=self.mjcf,
+                expected="a model that mujoco.MjModel.from_xml_path compiles",
+            ) from error
         if not model.ngeom:
             raise PipelineError(
                 "the model has no collision geometry", where=self.mjcf, expected="a geom that can collide"
@@ -141,7 +145,9 @@ class ObjectModel:
         try:
             root = ET.parse(self.mjcf).getroot()
         except (OSError, ET.ParseError) as error:
-            raise PipelineError(f"the model is not readable ({error})", where=self.mjcf) from error
+            raise PipelineError(
+                f"the model is not readable ({error})", where=self.mjcf, expected="a MuJoCo model in XML"
+            ) from error
         # Reject settings that would change the meaning of the geoms when they are moved to another model.
         folders = {"meshdir", "texturedir", "assetdir"}
         redirected = any(folders & set(compiler.attrib) for compiler in root.iter("compiler"))

@@ -189,7 +189,12 @@ def _files_of(path: Path) -> list[Path]:
         try:
             files = [path.parent / asset.attrib["file"] for asset in ET.parse(path).iterfind("asset/*[@file]")]
         except (OSError, ET.ParseError) as error:
-            raise PipelineError(f"the model is not readable ({error})", where=path) from error
+            raise PipelineError(
+                f"the model is not readable ({error})",
+                where=path,
+                expected="a MuJoCo model in XML",
+                remedy="correct the file, or move it out of the folder",
+            ) from error
     for file in files:
         if not file.resolve().is_relative_to(path.parent.resolve()):
             raise PipelineError(
@@ -225,7 +230,12 @@ def _check(mjcf: Path, path: Path) -> None:
     try:
         mujoco.MjModel.from_xml_string(f"<mujoco><asset>{assets}</asset><worldbody>{body}</worldbody></mujoco>")
     except ValueError as error:
-        raise PipelineError(f"MuJoCo cannot use the model ({error})", where=path) from error
+        raise PipelineError(
+            f"MuJoCo cannot use the model ({error})",
+            where=path,
+            expected="a model that mujoco.MjModel.from_xml_path compiles",
+            remedy="correct the file, or move it out of the folder",
+        ) from error
 
 
 def _copy(mjcf: Path, out: Path) -> None:

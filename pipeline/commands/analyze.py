@@ -204,7 +204,9 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
     seed, *further_seeds = sorted(seeds)
     if further_seeds:
         raise PipelineError(
-            f"the results have the seeds {sorted(seeds)}", expected="one seed, and therefore the same perturbations"
+            f"the results have the seeds {sorted(seeds)}",
+            expected="one seed, and therefore the same perturbations",
+            remedy="name the folders of one seed; evaluate the other models with this seed",
         )
     graded = grading.grade(results)
     write_tasks(graded, seed, out)

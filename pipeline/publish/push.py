@@ -106,7 +106,12 @@ def prepare(target: Format[Any], run: Run) -> Upload:
     _reject_other_settings(run)
     for file in target.written():
         for fault in file.faults():
-            raise PipelineError(fault.what, expected=fault.expected)
+            raise PipelineError(
+                fault.what,
+                where=target.folder,
+                expected=fault.expected,
+                remedy=f"move the file to another place, then generate it again by `{MAKE_AGAIN}`",
+            )
     sha256 = {target.repository_path(path): sha256 for path, sha256 in recorded.items()}
     others: dict[str, Path] = {}
     for folder, below, inside in ((CARD, target.name, ""), (FINETUNE, "", f"{FINETUNE}/")):

@@ -147,7 +147,12 @@ def read(dataset: Path) -> Iterator[StoredEpisode]:
         for file in lerobot:
             yield from _lerobot(file.parents[1])
     except (OSError, ValueError, KeyError) as error:
-        raise PipelineError(f"the dataset cannot be read ({type(error).__name__}: {error})", where=dataset) from error
+        raise PipelineError(
+            f"the dataset cannot be read ({type(error).__name__}: {error})",
+            where=dataset,
+            expected="whole datasets of RLDS or LeRobot",
+            remedy="copy or download the dataset again into another folder, and audit this folder",
+        ) from error
 
 
 def _visible_files(folder: Path, name: str) -> list[Path]:
