@@ -1,6 +1,7 @@
 """The dataset card, which explains the content of a repository to readers on the hub."""
 
 import inspect
+import json
 import re
 import shutil
 from collections import Counter
@@ -210,13 +211,14 @@ def attributions(rows: Iterable[Mapping[str, Any]]) -> dict[Credit, int]:
 
 
 def _own_rewrites(kept: Iterable[Mapping[str, Any]]) -> bool:
-    """Return whether an instruction is a rewrite from outside the shipped bank."""
+    """Return whether the shipped bank lacks the instruction or a further wording of an episode."""
     for row in kept:
-        for change in from_json(row["perturbations"]):
-            if isinstance(change, LanguagePerturbation):
-                of_task = load_bank().get(row["suite"], {}).get(row["task"], {})
-                if change.text not in chain(*of_task.values()):
-                    return True
+        changes = from_json(row["perturbations"])
+        instructions = {change.text for change in changes if isinstance(change, LanguagePerturbation)}
+        further_wordings = json.loads(row["rewrites"] or "[]")
+        shipped = load_bank().get(row["suite"], {}).get(row["task"], {})
+        if not instructions.union(further_wordings) <= {*chain(*shipped.values())}:
+            return True
     return False
 
 

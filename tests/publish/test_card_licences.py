@@ -1,5 +1,6 @@
 """The card attributes everything that is shown, and claims no licence or source that it does not know."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -76,14 +77,19 @@ def test_only_the_starter_sets_demonstrations_are_called_human(data: Path) -> No
     assert metadata_of(text)["license"] == "cc-by-4.0"
 
 
-def test_rewrites_of_another_bank_are_not_licensed(data: Path) -> None:
+@pytest.mark.parametrize("is_instruction", [True, False], ids=["an instruction", "a further wording"])
+def test_rewrites_of_another_bank_are_not_licensed(is_instruction: bool, data: Path) -> None:
     shipped = list_rewrites(STOVE)[0]
     write_rows(data, [row("clean", task=STOVE), row("language", shipped, task=STOVE)])
     text = written(data, "rlds")
     assert "that generated this dataset are under MIT.\n" in text
     assert metadata_of(text)["license"] == "cc-by-4.0"
     own = LanguagePerturbation(component="paraphrase", level=1, text="please turn that stove on for me")
-    write_rows(data, [row("clean", task=STOVE), row("language", own, task=STOVE)])
+    if is_instruction:
+        rows = [row("clean", task=STOVE), row("language", own, task=STOVE)]
+    else:
+        rows = [row("clean", task=STOVE) | {"rewrites": json.dumps([shipped.text, own.text])}]
+    write_rows(data, rows)
     text = written(data, "rlds")
     assert "others are by\n  the publisher of this dataset, and their licence is unknown." in text
     assert metadata_of(text)["license"] == "other"
