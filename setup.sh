@@ -33,7 +33,7 @@ find_python() {
     local wanted candidate conda=${CONDA_EXE:-}
     for wanted in "${PYTHONS[@]}"; do
         # Keep a finished installation. Replace an unfinished one, because uv would take it for finished.
-        if [[ -e .venv/installed && -x .venv/bin/pip && $(version_of .venv/bin/python) == "$wanted" ]]; then
+        if [[ -e .venv/installed && ! -e .venv/unfinished && -x .venv/bin/pip && $(version_of .venv/bin/python) == "$wanted" ]]; then
             echo .venv/bin/python
             return
         fi
@@ -97,18 +97,19 @@ install_packages() {
 }
 
 install_venv() {
-    local index aside
+    local index
     if [[ $PYTHON != .venv/bin/python ]]; then
-        # An environment without this script's mark is the user's.
-        if [[ -e .venv && ! -e .venv/of_setup ]]; then
-            aside=.venv.$(date +%Y%m%d%H%M%S)
-            mv .venv "$aside"
-            echo "setup.sh: moved .venv to $aside, because this script did not create it"
+        # Only delete what a first call left unfinished. Another environment may have the user's packages.
+        if [[ -L .venv || (-e .venv && ! -e .venv/of_setup) ]]; then
+            move_aside "this script did not create it"
+        elif [[ -e .venv/installed ]]; then
+            move_aside "an update of it was not finished, or its Python is gone"
         fi
         rm -rf .venv
         "$PYTHON" -m venv .venv || stopped "$PYTHON could not create .venv"
         touch .venv/of_setup
     fi
+    touch .venv/unfinished
     .venv/bin/pip install --quiet "uv==$UV_VERSION" || stopped "pip could not install uv"
     # uv does not read pip's configuration: pass it the mirror of this configuration.
     index=${PIP_INDEX_URL:-$(.venv/bin/pip config get global.index-url 2>/dev/null || true)}
@@ -124,6 +125,13 @@ install_venv() {
     .venv/bin/python -m pipeline.validation.loops || true
 }
 
+move_aside() {
+    local aside
+    aside=.venv.$(date +%Y%m%d%H%M%S)
+    mv .venv "$aside"
+    echo "setup.sh: moved .venv to $aside, because $1"
+}
+
 [[ $VERB =~ ^(run|quick|test|)$ ]] || fail "unknown verb '$VERB', expected run, quick, test or none"
 # The lock only has packages for this platform.
 [[ $(uname -sm) == "Linux x86_64" ]] || fail "this machine is $(uname -sm), not Linux x86_64"
@@ -136,10 +144,10 @@ if [[ -n $packages ]]; then
 fi
 
 stamp=$(cat setup.sh requirements.lock pyproject.toml | sha256sum)
-if [[ ! -x .venv/bin/python || $(cat .venv/installed 2>/dev/null) != "$stamp" ]]; then
-    rm -f .venv/installed
+if [[ ! -x .venv/bin/python || -e .venv/unfinished || $(cat .venv/installed 2>/dev/null) != "$stamp" ]]; then
     install_venv
     echo "$stamp" >.venv/installed
+    rm .venv/unfinished
 fi
 
 # The stages of DVC call `python`.

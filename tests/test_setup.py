@@ -120,12 +120,27 @@ def test_an_installation_that_failed_is_tried_again(tree: Tree) -> None:
     (tree.root / "requirements.lock").write_text("numpy==2.2.7\n")
     uv.write_text("#!/bin/bash\nexit 1\n")
     assert tree.setup().returncode != 0
+    (tree.root / ".venv" / "mine").touch()
     # Even for the lock that was installed before: half of another one is in place now.
     (tree.root / "requirements.lock").write_text("numpy==2.2.6\n")
     uv.write_text(works)
     tree.calls()
-    assert tree.setup().returncode == 0
+    done = tree.setup()
+    assert done.returncode == 0
     assert "uv pip sync --compile-bytecode --require-hashes requirements.lock" in tree.calls()
+    # The user may have added packages to the environment.
+    (aside,) = tree.root.glob(".venv.*")
+    assert (aside / "mine").exists()
+    assert f"moved .venv to {aside.name}, because an update of it was not finished" in done.stdout
+    assert tree.setup().returncode == 0
+    assert tree.calls() == []
+
+
+def test_a_link_in_the_place_of_the_environment_is_moved_aside(tree: Tree) -> None:
+    (tree.root / ".venv").symlink_to("elsewhere")
+    assert tree.setup().returncode == 0
+    (aside,) = tree.root.glob(".venv.*")
+    assert aside.is_symlink()
 
 
 def test_an_environment_of_the_user_is_moved_aside(tree: Tree) -> None:
