@@ -12,7 +12,8 @@ from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import evaluate as run_evaluation
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
+from pipeline.evaluation.evaluation import Evaluation
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.selection import Selection
 from pipeline.evaluation.tested import tested_in
 from pipeline.report import paper_rows

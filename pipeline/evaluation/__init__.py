@@ -2,12 +2,13 @@
 
 Modules, those of an evaluation from the command to its parts:
 
-* ``evaluate``: all episodes, in worker processes. ``rollout``: one episode, from task to row.
+* ``evaluate``: all episodes, in worker processes. ``evaluation``: names, versions and results of the episodes.
+  ``rollout``: one episode.
 * ``selection``, ``task_list``: the tasks of an evaluation. ``libero_plus``, ``held_out`` with ``held_out_sight``,
   ``recordings``, ``tasks``: sources of tasks, and their identification.
 * ``environment`` over ``simulator``: starts episodes, observes, takes actions.
-* ``policies``: interface of a policy. ``model_server``, ``checkpoint``, ``reference_policies``: policies. ``actions``:
-  checks of their answers.
+* ``policies``: interface of a policy. ``policy_config``: its configuration. ``model_server``, ``checkpoint``,
+  ``reference_policies``: policies. ``actions``: checks of their answers.
 * ``results``, ``statistics``: stored results, and their rates and intervals.
 
 Evaluations by other programs: ``harness`` for vla-eval; ``lerobot_eval`` for lerobot-eval, over ``gym_environment``;

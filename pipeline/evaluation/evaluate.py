@@ -19,10 +19,12 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out, recordings
 from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.model_server import warn_of_requests
 from pipeline.evaluation.policies import Policy
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import one_setting
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
+from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary
 from pipeline.evaluation.tasks import EvaluationTask, goal_task

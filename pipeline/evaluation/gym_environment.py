@@ -11,8 +11,8 @@ from gymnasium import spaces
 from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, not_begun
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.policies import Wanted
-from pipeline.evaluation.rollout import Evaluation
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.jpeg import resized
 from pipeline.types import Frame

@@ -26,10 +26,11 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import checked_actions, reject_other_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, not_begun
 from pipeline.evaluation.evaluate import check_settings, not_trained
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.model_server import NextLook
 from pipeline.evaluation.policies import Wanted, is_shortest
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.machine_code import ensure_fixed_machine_code

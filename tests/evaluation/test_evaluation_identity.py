@@ -24,9 +24,10 @@ from pipeline.evaluation import held_out, results
 from pipeline.evaluation.checkpoint import Checkpoint
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, Progress
 from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, libero_task
 from pipeline.libero.tasks import STEP_LIMITS

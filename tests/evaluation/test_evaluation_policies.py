@@ -38,10 +38,11 @@ from pipeline.evaluation.actions import PolicyError, checked_actions
 from pipeline.evaluation.checkpoint import Checkpoint, cameras_of
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment, evaluate
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.model_server import Server
 from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
 from pipeline.evaluation.tasks import libero_task
 

@@ -16,9 +16,10 @@ from libero_environment import OffScreenRenderEnv
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment
 from pipeline.evaluation.environment import EpisodeSettings
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.gym_environment import PerturbedLiberoEnv, identity_options
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import read, reject_different, stored
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.tasks import STEP_LIMITS, tasks

@@ -18,8 +18,9 @@ from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import check_settings, evaluate
+from pipeline.evaluation.evaluation import Evaluation
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles, EpisodeResult
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.control_env import control_env
