@@ -79,7 +79,7 @@ AXIS_IS_SUBJECT = {
     *("pipeline.testset.definitions", "pipeline.testset.own_tasks"),
     *("pipeline.evaluation.libero_plus", "pipeline.evaluation.other_programs", "pipeline.report.paper_table"),
     # Evaluation tasks that ask for another goal of a scene.
-    *("pipeline.evaluation.tasks", "pipeline.evaluation.selection"),
+    *("pipeline.evaluation.goals", "pipeline.evaluation.selection"),
     # What two axes do to a scene, which sampling a plan must not load.
     *("pipeline.scenes.placement", "pipeline.scenes.moving"),
     # The axis whose exported episodes are no demonstrations.

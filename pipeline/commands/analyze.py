@@ -224,15 +224,15 @@ def leakage(results: Path, config: Path) -> int:
     """
     from pipeline.axes import from_json
     from pipeline.evaluation import held_out
+    from pipeline.evaluation.goals import resolve_goal
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.tasks import goal_task
     from pipeline.libero.tasks import find_task
 
     perturbations, goals = [], []
     for row, _ in stored([results]):
         if row.source == "goals":
             task, *_ = row.trial
-            goals.append(goal_task(task)[1])
+            goals.append(resolve_goal(task)[1])
         if row.source != "own":
             continue
         for perturbation in from_json(json.dumps(row.perturbations)):

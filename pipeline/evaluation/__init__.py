@@ -4,8 +4,8 @@ Modules, those of an evaluation from the command to its parts:
 
 * ``evaluate``: all episodes, in worker processes. ``evaluation``: names, versions and results of the episodes.
   ``rollout``: one episode.
-* ``selection``, ``task_list``: the tasks of an evaluation. ``libero_plus``, ``held_out`` with ``held_out_sight``,
-  ``recordings``, ``tasks``: sources of tasks, and their identification.
+* ``selection``, ``task_list``: the tasks of an evaluation. ``tasks``: their identification. ``libero_plus``, ``goals``,
+  ``held_out`` with ``held_out_sight``, ``recordings``: their sources.
 * ``environment`` over ``simulator``: starts episodes, observes, takes actions.
 * ``policies``: interface of a policy. ``policy_config``: its configuration. ``model_server``, ``checkpoint``,
   ``reference_policies``: policies. ``actions``: checks of their answers.

@@ -16,11 +16,12 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RejectedError
 from pipeline.evaluation import held_out, libero_plus
 from pipeline.evaluation.actions import Actions, checked_actions
+from pipeline.evaluation.goals import CARRIED, find_replacement, resolve_goal
 from pipeline.evaluation.policies import VIEWS, StateAngle, Wanted
 from pipeline.evaluation.recordings import demonstration
 from pipeline.evaluation.results import REJECTED
 from pipeline.evaluation.simulator import Picture, Simulator
-from pipeline.evaluation.tasks import CARRIED, EvaluationTask, Prompt, find_replacement, goal_task, libero_states
+from pipeline.evaluation.tasks import EvaluationTask, Prompt, libero_states
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import STEP_LIMITS, SUITES, find_task
 from pipeline.testset import benchmark
@@ -280,7 +281,7 @@ class EpisodeEnvironment:
         """Start an episode of a LIBERO task with a replaced goal object, or with the goal of another task."""
         if CARRIED in self.task.name:
             seed, state = self._initial_state()
-            self._base, _ = goal_task(self.task)
+            self._base, _ = resolve_goal(self.task)
             self._build(self._base, self.task.base)
             self._start(seed, state)
             return

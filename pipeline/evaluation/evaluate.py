@@ -20,6 +20,7 @@ from pipeline.evaluation import held_out, recordings
 from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluation import Evaluation
+from pipeline.evaluation.goals import resolve_goal
 from pipeline.evaluation.model_server import warn_of_requests
 from pipeline.evaluation.policies import Policy
 from pipeline.evaluation.policy_config import PolicyConfig
@@ -27,7 +28,7 @@ from pipeline.evaluation.results import one_setting
 from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary
-from pipeline.evaluation.tasks import EvaluationTask, goal_task
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import write, write_json
 from pipeline.images.mp4 import mp4
 from pipeline.libero.tasks import SUITES, find_task
@@ -115,7 +116,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
 def not_trained(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
     """Leave out goals that a training plan carries to the same scenes, and print their number."""
     goals = set() if plan is None else held_out.planned(plan).goals
-    left = [task for task in wanted if task.source != "goals" or goal_task(task)[1] not in goals]
+    left = [task for task in wanted if task.source != "goals" or resolve_goal(task)[1] not in goals]
     if len(left) < len(wanted):
         print(f"left out, because the plan trains on them: {len(wanted) - len(left)} of {len(wanted)} goals")
     return left
