@@ -77,7 +77,7 @@ def test_imports_run_downwards(graph: dict[str, set[str]]) -> None:
 AXIS_IS_SUBJECT = {
     # The benchmark's files and the paper's table, which name the dimensions of the test tasks.
     *("pipeline.testset.definitions", "pipeline.testset.own_tasks"),
-    *("pipeline.evaluation.libero_plus", "pipeline.evaluation.other_programs", "pipeline.report.paper_table"),
+    *("pipeline.evaluation.libero_plus", "pipeline.evaluation.analyses.other_programs", "pipeline.report.paper_table"),
     # Evaluation tasks that ask for another goal of a scene.
     *("pipeline.evaluation.goals", "pipeline.evaluation.selection"),
     # What two axes do to a scene, which sampling a plan must not load.

@@ -11,12 +11,9 @@ Modules, those of an evaluation from the command to its parts:
   ``reference_policies``: policies. ``actions``: checks of their answers.
 * ``results``, ``statistics``: stored results, and their rates and intervals.
 
-Evaluations by other programs: ``harness`` for vla-eval; ``lerobot_eval`` for lerobot-eval, over ``gym_environment``;
-``other_programs`` reads the results of their own LIBERO-Plus environments.
+Evaluations by other programs: ``harness`` for vla-eval; ``lerobot_eval`` for lerobot-eval, over ``gym_environment``.
+Configurations of users name these two modules, so their paths stay.
 
-Analyses: ``composition`` (the gap), ``construction`` and ``grading`` (a benchmark of your own), ``focus``; ``tested``
-reads outcomes on LIBERO-Plus's test tasks.
-
-Comparison of a first observation: ``frame_report`` over ``frame_search``, ``start_frames``, ``picture_fit`` and
-``picture_points``.
+Folders: ``analyses`` of stored results, such as the compositional gap; ``first_observation``, the comparison of a
+user's picture with our frame.
 """

@@ -15,8 +15,8 @@ from episode_results import analyze, result
 
 from pipeline.axes import to_json
 from pipeline.errors import PipelineError
-from pipeline.evaluation import composition
-from pipeline.evaluation.composition import AxisPair
+from pipeline.evaluation.analyses import composition
+from pipeline.evaluation.analyses.composition import AxisPair
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.results import EpisodeFiles, Stored, stored

@@ -20,7 +20,7 @@ from pipeline.axes import level_of_test
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
-from pipeline.evaluation.grading import grade
+from pipeline.evaluation.analyses.grading import grade
 from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.libero_plus import moved_state, saved_array
 from pipeline.evaluation.results import EpisodeFiles

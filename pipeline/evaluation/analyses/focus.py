@@ -22,11 +22,11 @@ from scipy.optimize import brentq
 from pipeline.axes import Axis, axes_of, level_of_test
 from pipeline.config import NAME, Config, read_content, validate
 from pipeline.errors import PipelineError
+from pipeline.evaluation.analyses.other_programs import separate
+from pipeline.evaluation.analyses.tested import Outcome
 from pipeline.evaluation.goals import find_carried_task
-from pipeline.evaluation.other_programs import separate
 from pipeline.evaluation.results import EpisodeResult, read
 from pipeline.evaluation.statistics import wilson
-from pipeline.evaluation.tested import Outcome
 from pipeline.files import write as write_file
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import select_tasks
