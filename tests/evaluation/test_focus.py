@@ -20,7 +20,7 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.formats.rlds import RldsConfig
 from pipeline.libero.tasks import tasks
-from pipeline.planning.plan import apportion
+from pipeline.planning.apportion import apportion
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
 

@@ -30,7 +30,7 @@ from pipeline.evaluation.statistics import wilson
 from pipeline.files import write as write_file
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import select_tasks
-from pipeline.planning.plan import apportion
+from pipeline.planning.apportion import apportion
 from pipeline.strict_yaml import dump
 from pipeline.testset import benchmark
 from pipeline.types import Floats
