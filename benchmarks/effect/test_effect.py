@@ -34,7 +34,7 @@ from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
-from pipeline.evaluation.evaluate import _environment
+from pipeline.evaluation.evaluate import _open_environment
 from pipeline.evaluation.goals import resolve_goal
 from pipeline.evaluation.held_out import PlannedPerturbations, sample_perturbation
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
@@ -497,8 +497,8 @@ def command() -> Iterator[ModuleType]:
     loaded = module_from_spec(spec)
     spec.loader.exec_module(loaded)
     yield loaded
-    _environment(EpisodeSettings(), None).close()
-    _environment.cache_clear()
+    _open_environment(EpisodeSettings(), None).close()
+    _open_environment.cache_clear()
 
 
 @pytest.mark.slow

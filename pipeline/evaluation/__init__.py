@@ -2,8 +2,8 @@
 
 Modules, those of an evaluation from the command to its parts:
 
-* ``evaluate``: all episodes, in worker processes. ``evaluation``: names, versions and results of the episodes.
-  ``rollout``: one episode.
+* ``evaluate``: all episodes, in worker processes. ``setting_checks``: rejected settings. ``evaluation``: names,
+  versions and results of the episodes. ``rollout``: one episode.
 * ``selection``, ``task_list``: the tasks of an evaluation. ``tasks``: their identification. ``libero_plus``, ``goals``,
   ``held_out`` with ``held_out_sight``, ``recordings``: their sources.
 * ``environment`` over ``simulator``: starts episodes, observes, takes actions.

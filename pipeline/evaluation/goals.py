@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from pipeline.axes.goal import held_out, level
 from pipeline.axes.language_goal import found, pattern, thing_words, words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
+from pipeline.evaluation.held_out import planned
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
@@ -265,3 +267,12 @@ def resolve_goal(task: EvaluationTask) -> tuple[Task, Hashable]:
         return played, definition_of(played).asked
     replacement = find_replacement(base, task.name)
     return replace(base, instruction=replacement.instruction), _read_asked(base, replacement)
+
+
+def leave_out_trained_goals(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
+    """Leave out goals that a training plan carries to the same scenes, and print their number."""
+    goals = set() if plan is None else planned(plan).goals
+    left = [task for task in wanted if task.source != "goals" or resolve_goal(task)[1] not in goals]
+    if len(left) < len(wanted):
+        print(f"left out, because the plan trains on them: {len(wanted) - len(left)} of {len(wanted)} goals")
+    return left

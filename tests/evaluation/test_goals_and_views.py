@@ -14,8 +14,13 @@ from pipeline.axes.goal import GoalPerturbation, held_out
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.evaluate import not_trained
-from pipeline.evaluation.goals import CARRIED, find_replacement, list_replacements, resolve_goal
+from pipeline.evaluation.goals import (
+    CARRIED,
+    find_replacement,
+    leave_out_trained_goals,
+    list_replacements,
+    resolve_goal,
+)
 from pipeline.evaluation.harness import PerturbedLibero
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.results import EpisodeFiles
@@ -104,11 +109,11 @@ def test_goals_that_a_plan_trains_on_are_left_out(tmp_path: Path, capsys: pytest
     file.parent.mkdir()
     plan.write([plan.build_row(entry, (change,), 0, ReplayConfig())], file)
     wanted = select(Selection(source="goals", suites=("libero_object",)))
-    left = not_trained(wanted, file)
+    left = leave_out_trained_goals(wanted, file)
     (out,) = set(wanted) - set(left)
     assert (out.base, out.component) == (soup.name, "milk")
     assert capsys.readouterr().out == "left out, because the plan trains on them: 1 of 50 goals\n"
-    assert not_trained(wanted, None) == wanted
+    assert leave_out_trained_goals(wanted, None) == wanted
     selection = {"source": "goals", "suites": ["libero_object"]}
     assert len(PerturbedLibero(selection=selection, settings={"plan": str(file)}).get_tasks()) == len(left)
     capsys.readouterr()
