@@ -143,8 +143,9 @@ class Evaluation:
         Args:
             wanted: the parts of an observation that the policy asked for.
         """
-        task, progress = environment.task, environment.progress
-        perturbations = environment.perturbations if task.source == "own" else ()
+        episode = environment.episode
+        task, progress = episode.task, episode.progress
+        perturbations = episode.perturbations if task.source == "own" else ()
         component = "+".join(perturbation.component for perturbation in perturbations) or task.component
         self.files.save(
             EpisodeResult(
@@ -152,12 +153,12 @@ class Evaluation:
                 episode=self.episode(task),
                 prompt=self.settings.prompt,
                 instruction=environment.instruction,
-                step_limit=environment.step_limit,
+                step_limit=episode.step_limit,
                 seed=self.settings.seed,
                 success=progress.success,
                 reason=progress.reason,
                 steps=progress.steps,
-                looks=environment.looks,
+                looks=episode.looks,
                 perturbations=json.loads(to_json(perturbations)),
                 policy=self.policy.name(self.identity),
                 identity=self.identity,

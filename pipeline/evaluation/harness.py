@@ -155,8 +155,9 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         """
         progress = self._environment.progress
         if self._evaluation is not None and not progress.over:
+            limit = self._environment.episode.step_limit
             raise PipelineError(
-                f"the harness ended this episode after {progress.steps} of {self._environment.step_limit} steps",
+                f"the harness ended this episode after {progress.steps} of {limit} steps",
                 where="max_steps",
                 expected="episodes that end at the limit of their suite, where their results are written",
                 remedy="leave out max_steps, or leave out both out and label",

@@ -193,7 +193,7 @@ def test_held_out_perturbations_push_a_policy_once_and_the_result_says_how(tmp_p
     (task, *_) = select(chosen)
     evaluated = EpisodeEnvironment()
     evaluated.reset(task)
-    (push,) = evaluated.perturbations
+    (push,) = evaluated.episode.perturbations
     assert isinstance(push, DisturbancePerturbation)
     positions = []
     for _ in range(push.first_step + push.steps + 5):

@@ -98,7 +98,7 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
     for _ in range(2):
         for env in sharing:
             seen, _ = env.reset()
-            simulator, number = env._environment.simulator, env._environment.task.number
+            simulator, number = env._environment.simulator, env._environment.episode.task.number
             bowl = 1 + simulator.model.joint("akita_black_bowl_1_joint0").qposadr[0]
             np.testing.assert_allclose(
                 simulator.state[bowl:][:2], libero_states(STOVE)[number, bowl:][:2], atol=2e-3, err_msg=str(number)
