@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.frame_report import Report, compare_frame
-from pipeline.evaluation.start_frames import LastStartFrames
+from pipeline.evaluation.first_observation.frame_report import Report, compare_frame
+from pipeline.evaluation.first_observation.start_frames import LastStartFrames
 from pipeline.libero.tasks import find_task
 from pipeline.machine_code import ensure_fixed_machine_code
 

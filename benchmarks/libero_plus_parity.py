@@ -169,7 +169,7 @@ def compare(environment: EpisodeEnvironment, task: EvaluationTask, folder: Path)
     with np.load(folder / f"{task.suite}-{task.name}.npz") as theirs:
         states, views = theirs["states"], {view: theirs[view] for view in ("agentview", "wrist")}
     environment.reset(task)
-    perturbations = tuple(map(with_benchmark_noise, environment.perturbations))
+    perturbations = tuple(map(with_benchmark_noise, environment.episode.perturbations))
     environment._picture.show(environment.simulator.model, perturbations)
     state_error, grey, differing = 0.0, dict.fromkeys(views, 0), dict.fromkeys(views, 0)
     for step, state in enumerate(states):

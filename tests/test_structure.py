@@ -77,9 +77,9 @@ def test_imports_run_downwards(graph: dict[str, set[str]]) -> None:
 AXIS_IS_SUBJECT = {
     # The benchmark's files and the paper's table, which name the dimensions of the test tasks.
     *("pipeline.testset.definitions", "pipeline.testset.own_tasks"),
-    *("pipeline.evaluation.libero_plus", "pipeline.evaluation.other_programs", "pipeline.report.paper_table"),
+    *("pipeline.evaluation.libero_plus", "pipeline.evaluation.analyses.other_programs", "pipeline.report.paper_table"),
     # Evaluation tasks that ask for another goal of a scene.
-    *("pipeline.evaluation.tasks", "pipeline.evaluation.selection"),
+    *("pipeline.evaluation.goals", "pipeline.evaluation.selection"),
     # What two axes do to a scene, which sampling a plan must not load.
     *("pipeline.scenes.placement", "pipeline.scenes.moving"),
     # The axis whose exported episodes are no demonstrations.

@@ -19,11 +19,12 @@ from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.goals import resolve_goal
 from pipeline.evaluation.held_out import ATTEMPTS, PlannedPerturbations, sample_perturbation
 from pipeline.evaluation.model_server import Server
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
-from pipeline.evaluation.tasks import EvaluationTask, balanced, goal_task, libero_task
+from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task
 from pipeline.files import read_json, write_json
 from pipeline.libero.carried import carried, definition_of
 from pipeline.testset import benchmark
@@ -89,7 +90,7 @@ def _held_out_goals(tasks: Sequence[Task], states: int) -> list[EvaluationTask]:
             asked.add(definition_of(carried(instruction.asked, instruction.scene)).asked)
     suites = tuple(dict.fromkeys(task.suite for task in tasks))
     goals = select(Selection(source="goals", suites=suites, episodes=states))
-    return [goal for goal in goals if goal_task(goal)[1] in asked]
+    return [goal for goal in goals if resolve_goal(goal)[1] in asked]
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,9 @@ from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
-from pipeline.evaluation.evaluate import _environment
+from pipeline.evaluation.evaluate import _open_environment
+from pipeline.evaluation.goals import resolve_goal
 from pipeline.evaluation.held_out import PlannedPerturbations, sample_perturbation
-from pipeline.evaluation.tasks import goal_task
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
 from pipeline.libero.tasks import STEP_LIMITS, find_task
 from pipeline.planning.selection import pending
@@ -165,7 +165,7 @@ def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> N
     goals = [task for task in tested if task.source == "goals"]
     assert {task.number for task in goals} == set(range(5))
     held = {(scene.name, task.instruction) for task, scene in held_out("libero_object")}
-    assert {(task.base, goal_task(task)[0].instruction) for task in goals} == held
+    assert {(task.base, resolve_goal(task)[0].instruction) for task in goals} == held
     instructed = evaluation.instructed_episodes(experiment)
     assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(instructed)
 
@@ -497,8 +497,8 @@ def command() -> Iterator[ModuleType]:
     loaded = module_from_spec(spec)
     spec.loader.exec_module(loaded)
     yield loaded
-    _environment(EpisodeSettings(), None).close()
-    _environment.cache_clear()
+    _open_environment(EpisodeSettings(), None).close()
+    _open_environment.cache_clear()
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def table(results: tuple[Path, ...], out: Path | None) -> None:
     its tasks, prompt, step limits and trials. A policy of vla-eval or lerobot-eval has the name of its folder. The last
     line of the output is JSON.
     """
-    from pipeline.evaluation.other_programs import read_tested
+    from pipeline.evaluation.analyses.other_programs import read_tested
     from pipeline.report import paper_rows
     from pipeline.report.paper_table import table_of
 
@@ -131,7 +131,7 @@ def gap(results: Path) -> None:
     The results are those of `evaluate --source pairs`. The command writes gap.json and gap.png into their folder. The
     last line of the output is JSON.
     """
-    from pipeline.evaluation import composition
+    from pipeline.evaluation.analyses import composition
     from pipeline.evaluation.results import stored
 
     picture, findings = results / "gap.png", results / "gap.json"
@@ -170,7 +170,8 @@ def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on
     only an evaluation of the candidates shows it: with --results, these tasks are left out. The last line of the output
     is JSON.
     """
-    from pipeline.evaluation import construction, held_out
+    from pipeline.evaluation import held_out
+    from pipeline.evaluation.analyses import construction
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.task_list import reject_other_list, write_tasks
 
@@ -192,7 +193,7 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
     The command writes a list of the tasks with their difficulty, which `evaluate --tasks-from` reads. The last line of
     the output is JSON.
     """
-    from pipeline.evaluation import grading
+    from pipeline.evaluation.analyses import grading
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.task_list import reject_other_list, write_tasks
 
@@ -226,15 +227,15 @@ def leakage(results: Path, config: Path) -> int:
     """
     from pipeline.axes import from_json
     from pipeline.evaluation import held_out
+    from pipeline.evaluation.goals import resolve_goal
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.tasks import goal_task
     from pipeline.libero.tasks import find_task
 
     perturbations, goals = [], []
     for row, _ in stored([results]):
         if row.source == "goals":
             task, *_ = row.trial
-            goals.append(goal_task(task)[1])
+            goals.append(resolve_goal(task)[1])
         if row.source != "own":
             continue
         for perturbation in from_json(json.dumps(row.perturbations)):

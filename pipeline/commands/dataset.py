@@ -128,8 +128,8 @@ def compare_frame(picture: Path, task: str, init_state: int, view: str, sheet: P
     """
     from contextlib import closing
 
-    from pipeline.evaluation import frame_report
-    from pipeline.evaluation.start_frames import LastStartFrames
+    from pipeline.evaluation.first_observation import frame_report
+    from pipeline.evaluation.first_observation.start_frames import LastStartFrames
     from pipeline.libero.tasks import find_task, select_tasks
 
     if sheet is not None:

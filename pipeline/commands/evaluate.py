@@ -10,11 +10,12 @@ from dask.system import CPU_COUNT
 from pipeline.commands.base import PATH, Command, example, given, model_options
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
+from pipeline.evaluation.analyses.tested import tested_in
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import evaluate as run_evaluation
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
+from pipeline.evaluation.evaluation import Evaluation
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.selection import Selection
-from pipeline.evaluation.tested import tested_in
 from pipeline.report import paper_rows
 from pipeline.report.paper_table import table_of
 from pipeline.run import claim

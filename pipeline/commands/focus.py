@@ -52,7 +52,7 @@ def focus(results: tuple[Path, ...], source: Path, out: Path, episodes: int | No
     file, without the comments of CONFIG. Results of vla-eval and lerobot-eval count for LIBERO-Plus's test tasks only.
     The last line of the output is JSON.
     """
-    from pipeline.evaluation import focus as focusing
+    from pipeline.evaluation.analyses import focus as focusing
 
     limits = focusing.Limits(floor, cap)
     focused = focusing.write(results, source, out, episodes, limits)

@@ -2,20 +2,18 @@
 
 Modules, those of an evaluation from the command to its parts:
 
-* ``evaluate``: all episodes, in worker processes. ``rollout``: one episode, from task to row.
-* ``selection``, ``task_list``: the tasks of an evaluation. ``libero_plus``, ``held_out`` with ``held_out_sight``,
-  ``recordings``, ``tasks``: sources of tasks, and their identification.
+* ``evaluate``: all episodes, in worker processes. ``setting_checks``: rejected settings. ``evaluation``: names,
+  versions and results of the episodes. ``rollout``: one episode.
+* ``selection``, ``task_list``: the tasks of an evaluation. ``tasks``: their identification. ``libero_plus``, ``goals``,
+  ``held_out`` with ``held_out_sight``, ``recordings``: their sources.
 * ``environment`` over ``simulator``: starts episodes, observes, takes actions.
-* ``policies``: interface of a policy. ``model_server``, ``checkpoint``, ``reference_policies``: policies. ``actions``:
-  checks of their answers.
+* ``policies``: interface of a policy. ``policy_config``: its configuration. ``model_server``, ``checkpoint``,
+  ``reference_policies``: policies. ``actions``: checks of their answers.
 * ``results``, ``statistics``: stored results, and their rates and intervals.
 
-Evaluations by other programs: ``harness`` for vla-eval; ``lerobot_eval`` for lerobot-eval, over ``gym_environment``;
-``other_programs`` reads the results of their own LIBERO-Plus environments.
+Evaluations by other programs: ``harness`` for vla-eval; ``lerobot_eval`` for lerobot-eval, over ``gym_environment``.
+Configurations of users name these two modules, so their paths stay.
 
-Analyses: ``composition`` (the gap), ``construction`` and ``grading`` (a benchmark of your own), ``focus``; ``tested``
-reads outcomes on LIBERO-Plus's test tasks.
-
-Comparison of a first observation: ``frame_report`` over ``frame_search``, ``start_frames``, ``picture_fit`` and
-``picture_points``.
+Folders: ``analyses`` of stored results, such as the compositional gap; ``first_observation``, the comparison of a
+user's picture with our frame.
 """

@@ -1,8 +1,8 @@
 """Interface to the tasks of all sources: start an episode, observe, act."""
 
 import tempfile
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,11 +16,12 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RejectedError
 from pipeline.evaluation import held_out, libero_plus
 from pipeline.evaluation.actions import Actions, checked_actions
+from pipeline.evaluation.goals import CARRIED, find_replacement, resolve_goal
 from pipeline.evaluation.policies import VIEWS, StateAngle, Wanted
 from pipeline.evaluation.recordings import demonstration
 from pipeline.evaluation.results import REJECTED
 from pipeline.evaluation.simulator import Picture, Simulator
-from pipeline.evaluation.tasks import CARRIED, EvaluationTask, Prompt, find_replacement, goal_task, libero_states
+from pipeline.evaluation.tasks import EvaluationTask, Prompt, libero_states
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import STEP_LIMITS, SUITES, find_task
 from pipeline.testset import benchmark
@@ -126,6 +127,31 @@ class Progress:
         return self.reason != "running"
 
 
+@dataclass
+class Episode:
+    """State of the episode that an environment runs.
+
+    Attributes:
+        task: the evaluation task.
+        played: the task whose BDDL goal and instruction the episode has: that of LIBERO, the user's own, or one of
+            LIBERO with another goal.
+        step_limit: number of actions after which the episode is over.
+        perturbations: perturbations of the scene and the frames.
+        resolved: results of physics perturbations in this scene, as ``Scene.resolved``.
+        looks: number of observations.
+        frames: name of a view to its frame, for the views that were rendered since the last action.
+    """
+
+    task: EvaluationTask
+    played: Task
+    step_limit: int
+    progress: Progress = Progress()
+    perturbations: tuple[Perturbation, ...] = ()
+    resolved: Mapping[str, Any] = field(default_factory=dict)
+    looks: int = 0
+    frames: dict[str, Frame] = field(default_factory=dict)
+
+
 def not_begun(progress: Progress, task: EvaluationTask) -> PipelineError:
     """Return the error about an episode that is over before its first observation."""
     if progress.reason == REJECTED:
@@ -141,7 +167,7 @@ class EpisodeEnvironment:
     """Environment that runs episodes one after the other.
 
     Use one environment for many episodes, ordered by task, because it reuses the simulator of a scene. Frames are
-    rendered only on request; ``looks`` counts observations.
+    rendered only on request.
 
     Args:
         archive: folder of LIBERO-Plus's asset archive, for test tasks of light, background and layout.
@@ -149,9 +175,37 @@ class EpisodeEnvironment:
 
     def __init__(self, settings: EpisodeSettings = EpisodeSettings(), archive: Path | None = None):  # noqa: B008
         self.settings, self._archive = settings, archive
-        self.progress = Progress()
-        self._key: tuple[str, ...] = ()
+        self._episode: Episode | None = None
+        self._simulator: Simulator | None = None
+        self._simulated: tuple[str, ...] = ()
         self._picture = Picture()
+
+    @property
+    def episode(self) -> Episode:
+        """Return the running or last episode.
+
+        Raises:
+            PipelineError: before the first ``reset``.
+        """
+        if self._episode is None:
+            raise PipelineError("no episode has begun", expected="reset before any other use")
+        return self._episode
+
+    @property
+    def progress(self) -> Progress:
+        """Return the progress of the episode, also before the first ``reset``."""
+        return Progress() if self._episode is None else self._episode.progress
+
+    @property
+    def simulator(self) -> Simulator:
+        """Return the simulator of the episode's scene.
+
+        Raises:
+            PipelineError: before the first ``reset``.
+        """
+        if self._simulator is None:
+            raise PipelineError("no scene has been built", expected="reset before any other use")
+        return self._simulator
 
     def reset(self, task: EvaluationTask) -> Progress:
         """Start an episode: LIBERO's reset, the initial state, ten settling steps.
@@ -162,20 +216,37 @@ class EpisodeEnvironment:
             PipelineError: if the task cannot be rebuilt on this machine.
         """
         self._picture.restore()
-        self.progress = Progress()
-        self.task, self._base = task, find_task(task.suite, task.base)
-        self.step_limit = self.settings.step_limit(task.suite)
-        self.resolved: Mapping[str, Any] = {}
-        self.perturbations: tuple[Perturbation, ...] = ()
-        self._seen: dict[str, Frame] = {}
-        self.looks = 0
-        starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
+        self._episode = None
+        start = self._find_start(task)
+        episode = Episode(task, find_task(task.suite, task.base), self.settings.step_limit(task.suite))
+        self._episode = episode
         try:
-            starts.get(task.source, self._start_libero)()
-            self.progress = Progress(reason="running")
+            start(episode)
+            episode.progress = Progress(reason="running")
         except RejectedError as error:
-            self.progress = Progress(reason=REJECTED if task.source == "own" else error.reason)
-        return self.progress
+            episode.progress = Progress(reason=REJECTED if task.source == "own" else error.reason)
+        return episode.progress
+
+    def _find_start(self, task: EvaluationTask) -> Callable[[Episode], None]:
+        """Return the method that starts an episode of a task's source.
+
+        Raises:
+            PipelineError: if there is no such source.
+        """
+        starts: dict[str, Callable[[Episode], None]] = {
+            "libero": self._start_libero,
+            "own": self._start_libero,
+            "libero_plus": self._start_test_task,
+            "goals": self._start_goal,
+        }
+        if task.source not in starts:
+            raise PipelineError(
+                f"there is no source {task.source!r} of tasks",
+                where=str(task),
+                expected=" or ".join(starts),
+                remedy="select the tasks again with this version",
+            )
+        return starts[task.source]
 
     def step(self, action: ArrayLike) -> Progress:
         """Take one control step, 50 ms.
@@ -193,35 +264,38 @@ class EpisodeEnvironment:
             raise PipelineError("step got several actions", expected="one action, (7,)")
         if self.progress.over:
             raise PipelineError("no episode is running", expected="reset before step, and no step after its end")
+        episode = self.episode
         given[6] = -1.0 if given[6] < 0 else 1.0
-        steps = self.progress.steps + 1
-        self._seen = {}
+        steps = episode.progress.steps + 1
+        episode.frames = {}
         try:
             self.simulator.step(given, absolute=self.settings.actions == "absolute")
-            limited = "step_limit" if steps >= self.step_limit else "running"
-            self.progress = Progress(steps, "success" if self.simulator.succeeded() else limited)
+            limited = "step_limit" if steps >= episode.step_limit else "running"
+            episode.progress = Progress(steps, "success" if self.simulator.succeeded() else limited)
         except RejectedError as error:
-            self.progress = Progress(steps, error.reason)
-        return self.progress
+            episode.progress = Progress(steps, error.reason)
+        return episode.progress
 
     @property
     def instruction(self) -> str:
         """Return the instruction that the policy gets."""
-        if self.task.source == "libero_plus":
-            return libero_plus.instruction(self._test, self.settings.prompt)
-        return "" if self.settings.prompt == "blank" else self._base.instruction
+        episode = self.episode
+        if episode.task.source == "libero_plus":
+            return libero_plus.instruction(_find_test(episode.task), self.settings.prompt)
+        return "" if self.settings.prompt == "blank" else episode.played.instruction
 
     def image(self, view: str) -> Frame:
         """Return the (256, 256, 3) uint8 RGB image of ``agentview`` or ``wrist``.
 
         The image is turned by 180 degrees, as policies expect it.
         """
-        if view not in self._seen:
+        frames = self.episode.frames
+        if view not in frames:
             if self.settings.black in (view, "all"):
-                self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8)
+                frames[view] = np.zeros(SCHEMA.frame.shape, np.uint8)
             else:
-                self._seen[view] = self._picture.frame(VIEWS[view], self.simulator.observed, self.progress.steps)
-        return self._seen[view]
+                frames[view] = self._picture.frame(VIEWS[view], self.simulator.observed, self.progress.steps)
+        return frames[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
         """Return the observation of a policy in vla-eval's names.
@@ -235,7 +309,7 @@ class EpisodeEnvironment:
         views: Iterable[str] = ()
         if wanted.images:
             views = VIEWS if wanted.wrist else ("agentview",)
-        self.looks += 1
+        self.episode.looks += 1
         images = {view: self.image(view) for view in views}
         observation: dict[str, Any] = {"images": images, "task_description": self.instruction}
         if wanted.state:
@@ -253,96 +327,100 @@ class EpisodeEnvironment:
     def close(self) -> None:
         """Close the renderer and the simulator."""
         self._picture.close()
-        if self._key:
-            self.simulator.close()
-        self._key = ()
+        if self._simulator is not None:
+            self._simulator.close()
+        self._simulator, self._simulated = None, ()
 
-    def _start_test_task(self) -> None:
+    def _start_test_task(self, episode: Episode) -> None:
         """Start an episode of a test task of LIBERO-Plus."""
-        test = self._test
-        state = libero_states(self._base)[0]
+        test = _find_test(episode.task)
+        state = libero_states(episode.played)[0]
         source = AXES[test.axis].test_scene
         if source == "libero":
-            self._build(self._base)
+            self._build(episode.played)
         elif source == "scene files":
-            assets = self._assets(test)
+            assets = self._find_assets(test)
             files = SceneFiles(*(str(assets / path) for path in libero_plus.scene_files(test)))
-            self._build(self._base, test.name, files)
+            self._build(episode.played, test.name, files)
         else:
             if source == "bddl and models":
-                libero_plus.register_objects(test, self._assets(test))
-            self._build_from(libero_plus.bddl_text(test), test.name)
+                libero_plus.register_objects(test, self._find_assets(test))
+            self._build_from(libero_plus.bddl_text(test), episode.played, test.name)
             state = libero_plus.moved_state(test.suite, test.name)
-        self.perturbations = libero_plus.frame_changes(test, self.settings.seed)
-        self._start(self.settings.fixture_seed, state, libero_plus.posture_rad(test))
+        episode.perturbations = libero_plus.frame_changes(test, self.settings.seed)
+        self._start_from_reset(episode, self.settings.fixture_seed, state, libero_plus.posture_rad(test))
 
-    def _start_goal(self) -> None:
+    def _start_goal(self, episode: Episode) -> None:
         """Start an episode of a LIBERO task with a replaced goal object, or with the goal of another task."""
-        if CARRIED in self.task.name:
-            seed, state = self._initial_state()
-            self._base, _ = goal_task(self.task)
-            self._build(self._base, self.task.base)
-            self._start(seed, state)
+        task, base = episode.task, episode.played
+        if CARRIED in task.name:
+            seed, state = self._find_initial_state(task, base)
+            episode.played, _ = resolve_goal(task)
+            self._build(episode.played, task.base)
+            self._start_from_reset(episode, seed, state)
             return
-        replacement = find_replacement(self._base, self.task.name)
-        self._build_from(replacement.bddl_text(self._base), f"{replacement.old} {replacement.new}")
-        self._base = replace(self._base, instruction=replacement.instruction)
-        self._start(*self._initial_state())
+        replacement = find_replacement(base, task.name)
+        self._build_from(replacement.bddl_text(base), base, f"{replacement.old} {replacement.new}")
+        episode.played = replace(base, instruction=replacement.instruction)
+        self._start_from_reset(episode, *self._find_initial_state(task, base))
 
-    def _start_libero(self) -> None:
+    def _start_libero(self, episode: Episode) -> None:
         """Start an episode of a LIBERO task or an own task, with held-out perturbations if the task has any."""
-        self._build(self._base)
+        task, simulator = episode.task, self._build(episode.played)
         seed, recorded = self.settings.fixture_seed, self.settings.initial_states == "demonstration"
         if not recorded:
-            seed, state = self._initial_state()
-            if self.task.source == "libero":
-                self._start(seed, state)
+            seed, state = self._find_initial_state(task, episode.played)
+            if task.source == "libero":
+                self._start_from_reset(episode, seed, state)
                 return
-        demo = demonstration(self._base, self.task.number, self.settings.demos)
+        demo = demonstration(episode.played, task.number, self.settings.demos)
         if not recorded:
             demo = replace(demo, init_state=state, states=None, model_xml=None)
 
         def nominal() -> Scene:
             """Return the scene without perturbations."""
-            scene = recorded_start(demo, demo.model_xml or self.simulator.place_fixtures(seed))
+            scene = recorded_start(demo, demo.model_xml or simulator.place_fixtures(seed))
             # A recording begins with an open gripper. LIBERO restores its own states after its reset, which leaves the
             # gripper without a command.
             return scene if recorded else replace(scene, gripper=0.0)
 
         scene = None
-        if self.task.source == "own":
+        if task.source == "own":
             planned = None if self.settings.plan is None else held_out.planned(self.settings.plan)
-            self.perturbations, scene = held_out.held_out_scene(
-                self.task, self.settings.seed, demo, nominal, planned, self._picture.opened
+            episode.perturbations, scene = held_out.held_out_scene(
+                task, self.settings.seed, demo, nominal, planned, self._picture.opened
             )
         if scene is None and not recorded:
-            self._start(seed, demo.init_state)
+            self._start_from_reset(episode, seed, demo.init_state)
             return
         scene = scene or nominal()
-        self.resolved = scene.resolved
-        self.simulator.start_scene(scene)
-        self._picture.show(scene.model_xml, self.perturbations)
+        episode.resolved = scene.resolved
+        simulator.start_scene(scene)
+        self._picture.show(scene.model_xml, episode.perturbations)
 
-    def _start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
+    def _start_from_reset(
+        self, episode: Episode, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None
+    ) -> None:
         """Start from a state in the model of LIBERO's own reset."""
         self.simulator.start(seed, state, posture_rad)
-        self._picture.show(self.simulator.model, self.perturbations)
+        self._picture.show(self.simulator.model, episode.perturbations)
 
-    def _initial_state(self) -> tuple[int, Floats]:
-        """Return the seed of LIBERO's reset, and LIBERO's initial state for this task or a reset's state."""
-        if self._base.suite not in SUITES:
-            seed = self.settings.fixture_seed + self.task.number
+    def _find_initial_state(self, task: EvaluationTask, base: Task) -> tuple[int, Floats]:
+        """Return the seed of LIBERO's reset, and LIBERO's initial state of a task.
+
+        LIBERO has no initial states of a user's own task, which starts in the state of the reset.
+
+        Args:
+            base: the LIBERO task or own task of ``task``, whose scene is built.
+        """
+        if base.suite not in SUITES:
+            seed = self.settings.fixture_seed + task.number
             return seed, self.simulator.state_of_reset(seed)
-        states = libero_states(self._base)
-        number = self.task.number % len(states)
+        states = libero_states(base)
+        number = task.number % len(states)
         return self.settings.fixture_seed + number, states[number]
 
-    @property
-    def _test(self) -> TestTask:
-        """Return the benchmark's test task of this episode."""
-        return benchmark.load().find(self.task.suite, self.task.name)
-
-    def _assets(self, test: TestTask) -> Path:
+    def _find_assets(self, test: TestTask) -> Path:
         """Return the folder with the files that a test task needs.
 
         Raises:
@@ -352,23 +430,32 @@ class EpisodeEnvironment:
         if assets is None:
             raise PipelineError(
                 f"the task changes the {test.axis}, which needs the asset archive of LIBERO-Plus",
-                where=str(self.task),
+                where=f"libero_plus/{test.suite}/{test.name}",
                 expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}" if self._archive is None else None,
                 remedy="name the unpacked archive: --assets DIR",
             )
         return assets
 
-    def _build_from(self, bddl_text: str, scene: str) -> None:
-        """Build the simulator of the task from another BDDL text."""
+    def _build_from(self, bddl_text: str, base: Task, scene: str) -> None:
+        """Build the simulator of a task from another BDDL text."""
         with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / self._base.bddl_file.name
+            file = Path(folder) / base.bddl_file.name
             file.write_text(bddl_text)
-            self._build(replace(self._base, bddl_file=file), scene)
+            self._build(replace(base, bddl_file=file), scene)
 
-    def _build(self, task: Task, scene: str = "", files: SceneFiles | None = None) -> None:
-        """Build the simulator of a task, unless the current simulator has the same scene."""
-        key = (task.suite, task.name, scene)
-        if key != self._key:
+    def _build(self, task: Task, scene: str = "", files: SceneFiles | None = None) -> Simulator:
+        """Build the simulator of a task, unless the current simulator has the same scene.
+
+        Args:
+            scene: name of a scene that differs from the task's own.
+        """
+        simulated = (task.suite, task.name, scene)
+        if self._simulator is None or simulated != self._simulated:
             self.close()
-            self.simulator: Simulator = Simulator(task, files)
-            self._key = key
+            self._simulator, self._simulated = Simulator(task, files), simulated
+        return self._simulator
+
+
+def _find_test(task: EvaluationTask) -> TestTask:
+    """Return the benchmark's test task of an evaluation task."""
+    return benchmark.load().find(task.suite, task.name)

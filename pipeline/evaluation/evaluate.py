@@ -1,35 +1,33 @@
 """Complete evaluation: tasks run in worker processes, with one file per episode and a summary."""
 
-import atexit
-import ctypes
-import threading
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import mujoco
-
 from pipeline import gl
 from pipeline.axes import AXES
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
-from pipeline.evaluation import held_out, recordings
 from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.evaluation import Evaluation
+from pipeline.evaluation.goals import leave_out_trained_goals
 from pipeline.evaluation.model_server import warn_of_requests
 from pipeline.evaluation.policies import Policy
-from pipeline.evaluation.results import one_setting
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
+from pipeline.evaluation.policy_config import PolicyConfig
+from pipeline.evaluation.results import EpisodeResult, one_setting
+from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.setting_checks import check_policy_settings, check_settings
+from pipeline.evaluation.simulator import close_at_exit
 from pipeline.evaluation.statistics import summary
-from pipeline.evaluation.tasks import EvaluationTask, goal_task
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import write, write_json
 from pipeline.images.mp4 import mp4
-from pipeline.libero.tasks import SUITES, find_task
-from pipeline.types import Frame, Task
+from pipeline.types import Frame
 
 EPISODES_A_JOB = 10
 """Largest number of episodes in a job. Smaller jobs spread better over workers; larger jobs build fewer scenes."""
@@ -64,62 +62,67 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         PipelineError: if an episode has no result; the summary is written before. If the policy fails in
             ``FAILURES_IN_A_ROW`` consecutive episodes, no summary is written.
     """
-    settings, policy = evaluation.settings, evaluation.policy
-    if settings.look_every != 1 and policy.kind != "server":
-        raise PipelineError(
-            f"only a server can observe every {settings.look_every} steps", where="look_every", expected="--server"
-        )
-    if settings.state_angle != "server" and policy.kind != "server":
-        raise PipelineError("only a server has another range of angles", where="state_angle", expected="--server")
-    if settings.actions == "absolute" and policy.kind in ("open_loop", "tracked"):
-        raise PipelineError(
-            "the replays of demonstrations execute deltas", where="actions", expected="--server or --checkpoint"
-        )
-    selected = not_trained(select(selection, evaluation.archive), settings.plan)
+    settings = evaluation.settings
+    check_policy_settings(evaluation.policy, settings)
+    selected = leave_out_trained_goals(select(selection, evaluation.archive), settings.plan)
     check_settings(selection, selected, settings)
     evaluation.check(selected)
-    faults: dict[EvaluationTask, str] = {}
-    missing = [task for task in selected if evaluation.result(task) is None]
-    if missing:
-        if policy.kind == "server":
-            # Each worker connects for itself. This connection warns once, before the workers start.
-            warn_of_requests(policy.address, policy.timeout_s, settings.actions, settings.state_angle)
-        device = gl.choose().device
-        jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _jobs(missing, workers)]
-        work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)
-        for job_faults in run(work, jobs, "evaluate, episodes"):
-            faults |= job_faults
+    faults = _run_missing(evaluation, selected, run, workers)
     results = {task: evaluation.result(task) for task in selected}
-    rows = [row for row in results.values() if row is not None]
-    without_result = [task for task, row in results.items() if row is None]
-    changed = "the plan or the archive changed during the evaluation"
-    faults |= {task: changed for task in without_result if task not in faults}
-    summarised = summary(rows) | {
-        "policy": {"name": policy.name(evaluation.identity), "identity": evaluation.identity},
-        "selection": selection.model_dump(mode="json"),
-        "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
-    }
-    write_json(evaluation.folder / "summary.json", summarised)
-    # Other calls have written results of other tasks; equal settings are those of this call's results. A call without
-    # any result does not know them, and leaves a table of the policy as it is.
-    in_folder = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]
-    if rows or not in_folder:
-        evaluation.files.write_table(row for row in in_folder if row.settings == rows[0].settings)
+    for task, row in results.items():
+        if row is None:
+            faults.setdefault(task, "the plan or the archive changed during the evaluation")
+    summarised = _write_summary(evaluation, selection, [row for row in results.values() if row is not None])
     if faults:
         raise _without_result([*faults.items()])
     return summarised
 
 
-def not_trained(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
-    """Leave out goals that a training plan carries to the same scenes, and print their number."""
-    goals = set() if plan is None else held_out.planned(plan).goals
-    left = [task for task in wanted if task.source != "goals" or goal_task(task)[1] not in goals]
-    if len(left) < len(wanted):
-        print(f"left out, because the plan trains on them: {len(wanted) - len(left)} of {len(wanted)} goals")
-    return left
+def _run_missing(
+    evaluation: Evaluation, selected: Sequence[EvaluationTask], run: Workers, workers: int
+) -> dict[EvaluationTask, str]:
+    """Run the episodes of the selected tasks that have no up-to-date result.
+
+    Returns:
+        Task to the fault because of which its episode has no result.
+    """
+    missing = [task for task in selected if evaluation.result(task) is None]
+    if not missing:
+        return {}
+    settings, policy = evaluation.settings, evaluation.policy
+    if policy.kind == "server":
+        # Each worker connects for itself. This connection warns once, before the workers start.
+        warn_of_requests(policy.address, policy.timeout_s, settings.actions, settings.state_angle)
+    device = gl.choose().device
+    jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _divide_into_jobs(missing, workers)]
+    work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)
+    faults: dict[EvaluationTask, str] = {}
+    for job_faults in run(work, jobs, "evaluate, episodes"):
+        faults |= job_faults
+    return faults
 
 
-def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
+def _write_summary(evaluation: Evaluation, selection: Selection, rows: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Write ``summary.json`` of the selected episodes, and ``episodes.csv``; return the summary.
+
+    Args:
+        rows: results of the selected episodes.
+    """
+    summarised = summary(rows) | {
+        "policy": {"name": evaluation.policy.name(evaluation.identity), "identity": evaluation.identity},
+        "selection": selection.model_dump(mode="json"),
+        "settings": one_setting([(row, evaluation.files) for row in rows]) or evaluation.settings.model_dump(),
+    }
+    write_json(evaluation.folder / "summary.json", summarised)
+    # Other calls have written results of other tasks; equal settings are those of this call's results. A call without
+    # any result does not know them, and leaves a table of the policy as it is.
+    of_policy = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]
+    if rows or not of_policy:
+        evaluation.files.write_table(row for row in of_policy if row.settings == rows[0].settings)
+    return summarised
+
+
+def _divide_into_jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
     """Divide tasks into jobs of one scene each, in which the tasks of one axis follow each other.
 
     Tasks of the robot axis reset the arm to other postures; all other test tasks in a scene share one reset.
@@ -137,96 +140,6 @@ def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[Evaluat
     for scene in scenes.values():
         jobs += [tuple(scene[start : start + size]) for start in range(0, len(scene), size)]
     return jobs
-
-
-def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], settings: EpisodeSettings) -> None:
-    """Reject settings that do not apply to the selected tasks, and settings that would duplicate episodes.
-
-    Args:
-        wanted: the selected tasks.
-
-    Raises:
-        PipelineError: if a setting is rejected, or if the plan cannot be read.
-    """
-    if settings.seed != selection.seed:
-        raise PipelineError(
-            f"task selection uses seed {selection.seed}, but perturbations use seed {settings.seed}",
-            where="seed",
-            expected="one seed for both",
-        )
-    if settings.plan is not None:
-        held_out.sha256_of(settings.plan)
-        if not any(task.source in ("own", "goals") for task in wanted):
-            raise PipelineError(
-                "no task has held-out perturbations to compare with a plan",
-                where="plan",
-                expected="--source own or --source goals",
-            )
-    if settings.prompt == "benchmark" and not any(task.source == "libero_plus" for task in wanted):
-        raise PipelineError(
-            "no task has an instruction of the benchmark", where="prompt", expected="--source libero_plus"
-        )
-    if settings.step_limits == "lerobot" and not any(task.suite == "libero_spatial" for task in wanted):
-        raise PipelineError(
-            "lerobot's step limits differ only in libero_spatial, and no task of this suite is selected",
-            where="step_limits",
-            expected="openvla",
-        )
-    if settings.initial_states == "demonstration":
-        unsupported = {task.source for task in wanted} & {"libero_plus", "goals"}
-        if unsupported:
-            raise PipelineError(
-                f"tasks of {' and '.join(sorted(unsupported))} do not start in the first state of a demonstration",
-                where="initial_states",
-                expected="tasks of libero and own",
-                remedy="leave --initial-states out",
-            )
-        starts = Counter((task.suite, task.base) for task in wanted if task.source == "libero")
-        for (suite, name), episodes in starts.items():
-            count = recordings.count_of(find_task(suite, name), settings.demos)
-            if episodes > count:
-                raise PipelineError(
-                    f"{episodes - count} of {episodes} episodes of {suite}/{name} would be repetitions, because it has "
-                    f"{count} demonstration{'s' if count > 1 else ''}",
-                    where="initial_states",
-                    expected="at most one episode of each demonstration",
-                    remedy=f"set --episodes {count}, or leave --initial-states out",
-                )
-    _check_own_tasks(wanted, settings)
-
-
-def _check_own_tasks(wanted: Sequence[EvaluationTask], settings: EpisodeSettings) -> None:
-    """Reject settings that do not fit the user's own tasks.
-
-    Raises:
-        PipelineError: if own tasks lack a step limit or demonstrations, or if no selected task needs such a setting.
-    """
-    own_tasks = [task for task in wanted if task.suite not in SUITES]
-    if not own_tasks:
-        if settings.own_step_limit is not None:
-            raise PipelineError(
-                "LIBERO's suites have their own step limits, and no task of yours is selected",
-                where="own_step_limit",
-                expected="a suite of your own, by --suite",
-                remedy="leave --own-step-limit out",
-            )
-        return
-    if settings.own_step_limit is None and settings.demos is not None:
-        steps: dict[Task, int] = {}
-        for suite, name in sorted({(task.suite, task.base) for task in own_tasks}):
-            own_task = find_task(suite, name)
-            steps[own_task] = recordings.longest_steps(own_task, settings.demos)
-        longest = max(steps, key=lambda task: steps[task])
-        raise PipelineError(
-            f"LIBERO has no step limit for your suite {longest.suite}",
-            where="own_step_limit",
-            expected=f"more than the {steps[longest]} steps of the longest demonstration of {longest.name}; LIBERO's "
-            "limits are 3 to 14 % above its longest demonstrations",
-            remedy="add --own-step-limit N",
-        )
-    settings.step_limit(own_tasks[0].suite)
-    for suite, name in {(one.suite, one.base) for one in own_tasks if one.source == "own"}:
-        recordings.count_of(find_task(suite, name), settings.demos)
 
 
 @dataclass(frozen=True)
@@ -258,8 +171,8 @@ class EvaluationJob:
                 expected="one device for all frames, as devices differ by some grey levels",
             )
         settings, archive = self.evaluation.settings, self.evaluation.archive
-        environment = _environment(settings, archive)
-        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings)
+        environment = _open_environment(settings, archive)
+        policy = _open_policy(self.evaluation.policy, self.evaluation.identity, settings)
         faults = {}
         # A lost worker may have finished some episodes of this job.
         for task in self._missing():
@@ -308,25 +221,16 @@ class EvaluationJob:
 
 
 @lru_cache(maxsize=1)
-def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvironment:
-    """Return this process's environment, which stays open until the process ends."""
+def _open_environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvironment:
+    """Open this process's environment, which stays open until the process ends."""
     environment = EpisodeEnvironment(settings, archive)
-    if threading.current_thread() is threading.main_thread():
-        # Python calls exit handlers in reverse order. The first OpenGL context registers a handler that ends OpenGL, so
-        # the context is created before the environment's handler is registered.
-        gl.prepare()
-        mujoco.gl_context.GLContext(1, 1).free()
-        atexit.register(environment.close)
-    else:
-        # Only the thread that rendered may close the environment. A worker's thread is gone when its process ends, so
-        # an extra reference keeps Python from closing the environment.
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(environment))
+    close_at_exit(environment.close)
     return environment
 
 
 @lru_cache(maxsize=1)
-def _policy(policy_config: PolicyConfig, identity: str, settings: EpisodeSettings) -> Policy:
-    """Return this process's policy.
+def _open_policy(policy_config: PolicyConfig, identity: str, settings: EpisodeSettings) -> Policy:
+    """Open this process's policy.
 
     Raises:
         PipelineError: if it is not the policy with which the evaluation began.

@@ -11,8 +11,8 @@ from gymnasium import spaces
 from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, not_begun
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.policies import Wanted
-from pipeline.evaluation.rollout import Evaluation
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.jpeg import resized
 from pipeline.types import Frame
@@ -111,7 +111,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
     @property
     def task(self) -> str:
         """Return the name of the current task."""
-        return self._environment.task.name
+        return self._environment.episode.task.name
 
     @property
     def task_description(self) -> str:
@@ -165,7 +165,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
 
     def _look(self) -> Observation:
         """Return the observation; views are upside down as LIBERO renders them, and lerobot's processor turns them."""
-        self._environment.looks += 1
+        self._environment.episode.looks += 1
         simulator = self._environment.simulator
         observed = simulator.observed
         upright = {name: resized(self._environment.image(view), *self._size_px) for name, view in CAMERAS.items()}

@@ -25,12 +25,14 @@ from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import checked_actions, reject_other_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, not_begun
-from pipeline.evaluation.evaluate import check_settings, not_trained
+from pipeline.evaluation.evaluation import Evaluation
+from pipeline.evaluation.goals import leave_out_trained_goals
 from pipeline.evaluation.model_server import NextLook
 from pipeline.evaluation.policies import Wanted, is_shortest
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.setting_checks import check_settings
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.machine_code import ensure_fixed_machine_code
 
@@ -109,7 +111,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     def get_tasks(self) -> list[dict[str, Any]]:
         """Return one task per episode; ``name`` is unique, ``suite`` is LIBERO's."""
         settings = self._environment.settings
-        tasks = not_trained(select(self._selection, self._archive), settings.plan)
+        tasks = leave_out_trained_goals(select(self._selection, self._archive), settings.plan)
         check_settings(self._selection, tasks, settings)
         if self._evaluation is not None:
             self._evaluation.check(tasks)
@@ -153,8 +155,9 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         """
         progress = self._environment.progress
         if self._evaluation is not None and not progress.over:
+            limit = self._environment.episode.step_limit
             raise PipelineError(
-                f"the harness ended this episode after {progress.steps} of {self._environment.step_limit} steps",
+                f"the harness ended this episode after {progress.steps} of {limit} steps",
                 where="max_steps",
                 expected="episodes that end at the limit of their suite, where their results are written",
                 remedy="leave out max_steps, or leave out both out and label",

@@ -16,10 +16,11 @@ from lerobot.envs.configs import EnvConfig, LiberoEnv
 from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
-from pipeline.evaluation.evaluate import check_settings
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.gym_environment import PerturbedLiberoEnv, identity_options
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.setting_checks import check_settings
 from pipeline.evaluation.tasks import EvaluationTask
 
 try:

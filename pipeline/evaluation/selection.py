@@ -15,9 +15,10 @@ from pipeline.axes.base import LEVELS
 from pipeline.axes.component_names import ComponentName
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
+from pipeline.evaluation.goals import list_carried_tasks, list_replacements
 from pipeline.evaluation.held_out import OWN_AXES, held_out_task
 from pipeline.evaluation.task_list import read_tasks
-from pipeline.evaluation.tasks import EvaluationTask, balanced, carried_tasks, libero_task, replacements
+from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task
 from pipeline.libero.tasks import SUITES, suites, tasks
 from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Frozen, Task
@@ -181,10 +182,10 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
                 case "libero":
                     yield libero_task(task, number)
                 case "goals":
-                    for replacement in replacements(task):
+                    for replacement in list_replacements(task):
                         name, kind = replacement.name(task, number), replacement.category
                         yield EvaluationTask("goals", task.suite, task.name, name, "goal", kind, 0, number)
-                    yield from carried_tasks(task, number)
+                    yield from list_carried_tasks(task, number)
                 case "own":
                     kinds = product(selection.axes or OWN_AXES, selection.levels or LEVELS)
                     sampled = (held_out_task(task, axis, level, number, selection.seed) for axis, level in kinds)

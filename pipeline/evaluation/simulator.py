@@ -1,6 +1,9 @@
 """Simulator of one task for the evaluation of policies, reused between episodes, and the renderer of its scenes."""
 
-from collections.abc import Mapping, Sequence
+import atexit
+import ctypes
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import gl
 from pipeline.axes import Perturbation
 from pipeline.libero.starts import SETTLING_STEPS
 from pipeline.machine_code import fixed_machine_code
@@ -267,3 +271,26 @@ class Picture:
         """Close the renderer."""
         self.show("", ())
         self._opened.close()
+
+
+def close_at_exit(close: Callable[[], None]) -> None:
+    """Arrange the end of an environment that this thread uses until the process ends.
+
+    Only the thread that rendered may free a renderer, because an OpenGL context belongs to one thread.
+
+    * The main thread still runs when Python exits. It calls ``close`` then, before OpenGL ends.
+    * A thread of a worker process is gone by then. The environment must never be freed: Python would free it on
+      another thread. The operating system frees its memory with the process.
+
+    Args:
+        close: method of the environment that closes it; it keeps the environment alive.
+    """
+    if threading.current_thread() is threading.main_thread():
+        # Python calls exit handlers in reverse order. The first OpenGL context registers a handler that ends OpenGL, so
+        # the context is created before ``close`` is registered.
+        gl.prepare()
+        mujoco.gl_context.GLContext(1, 1).free()
+        atexit.register(close)
+    else:
+        # A reference that nobody releases; a module's variable would be cleared when Python exits.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(close))

@@ -1,13 +1,13 @@
 """Plan: a table with one row per candidate episode. All random numbers are sampled here, by key, never by position."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from itertools import count, islice
+from itertools import islice
 from math import ceil
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import pyarrow as pa
 
@@ -25,13 +25,13 @@ from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import DemoEntry
+from pipeline.planning.apportion import apportion
+from pipeline.planning.sampler import Sampler, sample_candidates
 from pipeline.seeding import digest, rng
 from pipeline.tables import read_table, write_table
 from pipeline.testset.benchmark import TestSet, is_in_tested_scene
 from pipeline.testset.own_tasks import reject_test_tasks
 from pipeline.types import Task
-
-_ATTEMPTS = 100
 
 RESET = "reset"
 """Name in the column ``axis`` of unperturbed episodes that start from a reset of LIBERO's environment."""
@@ -128,30 +128,11 @@ def _plan_entry(
     for task, demos in demos_of.items():
         wanted = wanted_of[task]
         shuffled = sorted(demos, key=lambda demo: digest(plan.seed, name, demo.demo_id))
-        candidates = islice(_candidates(sampler, shuffled), wanted + ceil(wanted * plan.reserve))
+        candidates = islice(sample_candidates(sampler, shuffled), wanted + ceil(wanted * plan.reserve))
         for rank, (demo, perturbations, variant) in enumerate(candidates):
             candidate = build_row(demo, perturbations, plan.seed, replay)
             rows.append(replace(candidate, rank=rank, variant=variant, wanted=rank < wanted))
     return rows
-
-
-def apportion(total: int, weights: Sequence[float], least: int = 0) -> list[int]:
-    """Divide a number in proportion to weights, by largest remainders; of equal remainders, the first are larger.
-
-    Args:
-        total: the number to divide, at least ``least`` for each weight.
-        weights: weights, not all 0.
-        least: smallest part.
-    """
-    sum_of_weights = sum(weights)
-    exact = [total * weight / sum_of_weights for weight in weights]
-    parts = [max(least, int(part)) for part in exact]
-    places = range(len(parts))
-    while sum(parts) < total:
-        parts[max(places, key=lambda place: exact[place] - parts[place])] += 1
-    while sum(parts) > total:
-        parts[max(places, key=lambda place: (parts[place] > least, parts[place] - exact[place]))] -= 1
-    return parts
 
 
 def _all_apply(axes: Sequence[Axis], task: Task) -> bool:
@@ -219,205 +200,6 @@ def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
     """
     planned = Counter(row.axis for row in rows if row.wanted)
     return {axis: wanted - planned[axis] for axis, wanted in plan.episodes.items() if wanted != planned[axis]}
-
-
-class TakenEntries:
-    """Counts of the list entries that the candidates of one task have taken, for axes that take entries of lists.
-
-    A candidate takes one of the entries that the fewest earlier candidates have; its key decides between them. All
-    entries are therefore used once before any is used again. An additional demonstration changes few entries of the
-    other demonstrations.
-    """
-
-    def __init__(self) -> None:
-        """Start without any taken entry."""
-        self._times: Counter[str] = Counter()
-
-    def order(self, entries: Sequence[str], key: str) -> list[int]:
-        """Return the places of the entries in the order in which a candidate tries them; [0] for an empty list."""
-        if not entries:
-            return [0]
-
-        def rank(place: int) -> tuple[int, str]:
-            entry = entries[place]
-            return self._times[entry], digest(key, entry)
-
-        return sorted(range(len(entries)), key=rank)
-
-    def take(self, entries: Sequence[str], place: int) -> None:
-        """Count the entry at ``place`` as taken by a candidate."""
-        if entries:
-            self._times[entries[place]] += 1
-
-
-class _Choice(NamedTuple):
-    """First sample of an axis.
-
-    Attributes:
-        task: the task that the axis perturbs, which an earlier axis may have carried to another scene.
-        earlier: perturbations that the episode's start has from an expansion; none if the episode starts from a reset.
-        place: index into the axis's ``entries``.
-    """
-
-    axis: Axis
-    task: Task
-    earlier: Sequence[Perturbation]
-    place: int
-    perturbation: Perturbation
-
-
-@dataclass(frozen=True)
-class Sampler:
-    """Source of perturbations for a plan's episodes of one axis or combination.
-
-    Attributes:
-        name: name of the axis or combination, as in ``plan.episodes``.
-        axes: axes to sample from.
-        seed: seed of the plan.
-        test: the benchmark's tasks, to which perturbations keep their clearance.
-    """
-
-    name: str
-    axes: Sequence[Axis]
-    seed: int
-    test: TestSet
-
-    def sample(
-        self, demo_id: str, task: Task, taken: TakenEntries | None = None, expanded_by: str = "[]"
-    ) -> Iterator[tuple[Perturbation, ...]]:
-        """Sample for one demonstration, variant after variant: all different, and each at its clearance from all tests.
-
-        Args:
-            taken: list entries that other demonstrations of the task have taken; no entries by default.
-            expanded_by: JSON of the perturbations with which an expansion generated the demonstration.
-
-        Yields:
-            One perturbation of each axis, until no different one is left.
-
-        Raises:
-            PipelineError: when another version with other perturbations generated the demonstration.
-        """
-        earlier = _earlier(demo_id, expanded_by)
-        taken = taken or TakenEntries()
-        sampled: set[tuple[str, ...]] = set()
-        for variant in count():
-            key = (demo_id, variant)
-            for attempt in range(_ATTEMPTS):
-                choices = self._sample_axes(task, attempt, taken, earlier, key)
-                perturbations = self._sample_all_clear(choices, (*key, attempt))
-                content = tuple(perturbation.model_dump_json() for perturbation in perturbations or ())
-                if perturbations and content not in sampled:
-                    break
-            else:
-                return
-            sampled.add(content)
-            for choice in choices:
-                taken.take(choice.axis.entries(choice.task), choice.place)
-            yield perturbations
-
-    def _sample_axes(
-        self, task: Task, attempt: int, taken: TakenEntries, earlier: Sequence[Perturbation], key: tuple[str | int, ...]
-    ) -> list[_Choice]:
-        """Sample one perturbation of each axis, in the order in which they apply."""
-        # One generator samples all first perturbations. Each axis that samples again uses a generator of its own.
-        random = rng(self.seed, self.name, *key, attempt)
-        choices: list[_Choice] = []
-        for axis in self.axes:
-            turn = taken.order(axis.entries(task), digest(self.seed, self.name, *key))
-            place = turn[attempt % len(turn)]
-            perturbation = axis.sample_after(random, task, place, earlier)
-            choices.append(_Choice(axis, task, earlier, place, perturbation))
-            task = perturbation.played(task)
-            if perturbation.reset_seed is not None:
-                earlier = ()
-        return choices
-
-    def _sample_all_clear(
-        self, choices: Sequence[_Choice], key: tuple[str | int, ...]
-    ) -> tuple[Perturbation, ...] | None:
-        """Return one perturbation of each choice, or ``None`` if an axis has none that is clear."""
-        texts = [choice.perturbation for choice in choices]
-        instruction = " ".join(change.apply("") for change in texts if isinstance(change, TextPerturbation))
-        perturbations = []
-        for number, choice in enumerate(choices):
-            clear = self._sample_clear(choice, instruction, (*key, number))
-            if clear is None:
-                return None
-            perturbations.append(clear)
-        return tuple(perturbations)
-
-    def _sample_clear(self, choice: _Choice, instruction: str, key: tuple[str | int, ...]) -> Perturbation | None:
-        """Return the chosen perturbation if it is clear, else sample a clear one of its component and level.
-
-        A clear perturbation keeps its clearance to the test set, unless the axis keeps none, and the ``instruction``
-        does not name it. Component and level are kept because strengths near the test set's would otherwise become
-        rare.
-
-        Returns:
-            The perturbation. ``None`` if many attempts give no clear one, or if the axis takes the entries of a list:
-            the caller then tries the next entry.
-        """
-        axis, task, first = choice.axis, choice.task, choice.perturbation
-
-        def is_clear(perturbation: Perturbation) -> bool:
-            if perturbation.named_in(instruction):
-                return False
-            nearest = perturbation.nearest(self.test, task)
-            return nearest.distance >= perturbation.clearance or not axis.keeps_clearance
-
-        if is_clear(first):
-            return first
-        if axis.entries(task):
-            return None
-        random = rng(self.seed, self.name, *key)
-        axis_at_level = axis.model_copy(update={"levels": (first.level,)})
-        for _ in range(_ATTEMPTS):
-            perturbation = axis_at_level.sample_after(random, task, 0, choice.earlier)
-            is_alike = (perturbation.component, perturbation.level) == (first.component, first.level)
-            if is_alike and is_clear(perturbation):
-                return perturbation
-        return None
-
-
-def _earlier(demo_id: str, expanded_by: str) -> tuple[Perturbation, ...]:
-    """Read the perturbations with which an expansion generated a demonstration.
-
-    Raises:
-        PipelineError: when another version with other perturbations generated it.
-    """
-    try:
-        return tuple(from_json(expanded_by))
-    except PipelineError as error:
-        raise PipelineError(
-            f"the perturbations of this expanded demonstration cannot be read ({error.what})",
-            where=demo_id,
-            expected="perturbations of this version",
-            remedy="expand the human demonstrations again into another folder",
-        ) from error
-
-
-def _candidates(
-    sampler: Sampler, group: Sequence[DemoEntry]
-) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:
-    """List a task's candidates: the first variant of every demonstration, then the second of every one, and so on.
-
-    A demonstration without further different perturbations is skipped. The candidates end when all demonstrations are
-    skipped.
-
-    Yields:
-        Demonstration, perturbations and number of the variant.
-    """
-    taken = TakenEntries()
-    samples = {demo: sampler.sample(demo.demo_id, demo.task, taken, demo.perturbations) for demo in group}
-    for variant in count():
-        for demo, of_demo in [*samples.items()]:
-            perturbations = next(of_demo, None)
-            if perturbations is None:
-                del samples[demo]
-            else:
-                yield demo, perturbations, variant
-        if not samples:
-            return
 
 
 def build_row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, replay: ReplayConfig) -> Row:

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from itertools import chain, combinations
 from typing import Any
 
+from pipeline.evaluation.analyses.tested import tested_policy
 from pipeline.evaluation.results import EpisodeResult, Evaluated, mixed_versions, versions_of
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary
-from pipeline.evaluation.tested import tested_policy
 from pipeline.grouping import grouped
 from pipeline.report.paper_table import table_of
 

@@ -11,8 +11,8 @@ from typing import Any, Protocol
 import yaml
 
 from pipeline.axes import AXES, level_of_test
+from pipeline.evaluation.analyses.tested import TestedPolicy
 from pipeline.evaluation.statistics import wilson
-from pipeline.evaluation.tested import TestedPolicy
 from pipeline.grouping import grouped
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask

@@ -26,7 +26,7 @@ from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import environment_of
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import at_reset, compute_settled_state, replay, roll_out
-from pipeline.planning.plan import Sampler
+from pipeline.planning.sampler import Sampler
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
 from pipeline.rendering.renderer import LastScene, scene_of_process

@@ -14,8 +14,9 @@ from pipeline.axes.robot import RobotPerturbation
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import RejectedError
 from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.policies import Wanted
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment
@@ -192,7 +193,7 @@ def test_held_out_perturbations_push_a_policy_once_and_the_result_says_how(tmp_p
     (task, *_) = select(chosen)
     evaluated = EpisodeEnvironment()
     evaluated.reset(task)
-    (push,) = evaluated.perturbations
+    (push,) = evaluated.episode.perturbations
     assert isinstance(push, DisturbancePerturbation)
     positions = []
     for _ in range(push.first_step + push.steps + 5):

@@ -9,8 +9,9 @@ import scipy.stats
 from episode_results import result
 from numpy.typing import NDArray
 
-from pipeline.evaluation import composition, statistics
-from pipeline.evaluation.composition import AxisPair, gap
+from pipeline.evaluation import statistics
+from pipeline.evaluation.analyses import composition
+from pipeline.evaluation.analyses.composition import AxisPair, gap
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.statistics import Interval, compare, difference, interval, mcnemar
 from pipeline.evaluation.tasks import EvaluationTask

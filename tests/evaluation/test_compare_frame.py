@@ -11,10 +11,10 @@ import pytest
 
 from pipeline.__main__ import main
 from pipeline.errors import PipelineError
-from pipeline.evaluation import picture_fit
-from pipeline.evaluation.frame_report import Report, write_sheet
-from pipeline.evaluation.picture_points import place
-from pipeline.evaluation.start_frames import LastStartFrames
+from pipeline.evaluation.first_observation import picture_fit
+from pipeline.evaluation.first_observation.frame_report import Report, write_sheet
+from pipeline.evaluation.first_observation.picture_points import place
+from pipeline.evaluation.first_observation.start_frames import LastStartFrames
 
 CASES = {case.name: case for case in frame_causes.cases()}
 

@@ -15,8 +15,8 @@ from episode_results import analyze, result
 
 from pipeline.axes import to_json
 from pipeline.errors import PipelineError
-from pipeline.evaluation import composition
-from pipeline.evaluation.composition import AxisPair
+from pipeline.evaluation.analyses import composition
+from pipeline.evaluation.analyses.composition import AxisPair
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.results import EpisodeFiles, Stored, stored
@@ -161,13 +161,13 @@ def test_a_pair_composes_the_perturbations_of_its_singles() -> None:
     evaluated = EpisodeEnvironment()
     tasks = {task.axis: task for task in some_pairs(axes=("layout", "robot", "camera"))}
     evaluated.reset(tasks["robot"])
-    robot = evaluated.perturbations
+    robot = evaluated.episode.perturbations
     evaluated.reset(tasks["layout"])
-    layout, placed = evaluated.perturbations, evaluated.resolved["layout"]
+    layout, placed = evaluated.episode.perturbations, evaluated.episode.resolved["layout"]
     evaluated.reset(tasks["layout+robot"])
-    assert tuple(evaluated.perturbations) == (*layout, *robot)
-    assert evaluated.resolved["layout"] == placed, "objects stand where they stand without the other axis"
-    assert evaluated.resolved.keys() == {"layout", "robot"}
+    assert tuple(evaluated.episode.perturbations) == (*layout, *robot)
+    assert evaluated.episode.resolved["layout"] == placed, "objects stand where they stand without the other axis"
+    assert evaluated.episode.resolved.keys() == {"layout", "robot"}
     evaluated.reset(tasks["robot+camera"])
-    assert [one.axis for one in evaluated.perturbations] == ["robot", "camera"]
+    assert [one.axis for one in evaluated.episode.perturbations] == ["robot", "camera"]
     evaluated.close()

@@ -27,7 +27,7 @@ from pipeline.axes.noise import NoisePerturbation
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.evaluate import _environment
+from pipeline.evaluation.evaluate import _open_environment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.simulator import Simulator
@@ -250,8 +250,8 @@ def evaluate_here() -> Iterator[Evaluate]:
             assert main() == 0
 
     yield run
-    _environment(EpisodeSettings(initial_states="demonstration"), None).close()
-    _environment.cache_clear()
+    _open_environment(EpisodeSettings(initial_states="demonstration"), None).close()
+    _open_environment.cache_clear()
 
 
 def rows(out: Path) -> dict[str, dict[str, Any]]:

@@ -23,11 +23,13 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out, results
 from pipeline.evaluation.checkpoint import Checkpoint
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, Progress
-from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
+from pipeline.evaluation.evaluate import EvaluationJob, _open_environment, evaluate
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.setting_checks import check_settings
 from pipeline.evaluation.tasks import EvaluationTask, libero_task
 from pipeline.libero.tasks import STEP_LIMITS
 
@@ -42,7 +44,7 @@ def short() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(STEP_LIMITS, STOVE.suite, STEPS)
         yield
-    _environment(SETTINGS, None).close()
+    _open_environment(SETTINGS, None).close()
 
 
 def test_the_table_of_test_tasks_is_of_one_observation(tmp_path: Path) -> None:

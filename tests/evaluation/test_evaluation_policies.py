@@ -37,11 +37,12 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import PolicyError, checked_actions
 from pipeline.evaluation.checkpoint import Checkpoint, cameras_of
 from pipeline.evaluation.environment import EpisodeSettings
-from pipeline.evaluation.evaluate import _environment, evaluate
+from pipeline.evaluation.evaluate import _open_environment, evaluate
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.model_server import Server
 from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
 from pipeline.evaluation.tasks import libero_task
 
@@ -89,8 +90,8 @@ def test_a_server_of_other_actions_is_rejected(monkeypatch: pytest.MonkeyPatch) 
 def memory_given_back() -> Iterator[None]:
     """A process keeps its environment for the next evaluation."""
     yield
-    _environment(RECORDED, None).close()
-    _environment.cache_clear()
+    _open_environment(RECORDED, None).close()
+    _open_environment.cache_clear()
 
 
 def images(**keys: int) -> dict[str, PolicyFeature]:

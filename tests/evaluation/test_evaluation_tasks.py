@@ -5,7 +5,7 @@ import json
 import pickle
 import re
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +20,15 @@ from pipeline.axes import level_of_test
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
-from pipeline.evaluation.grading import grade
+from pipeline.evaluation.analyses.grading import grade
+from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.libero_plus import moved_state, saved_array
+from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary, wilson
-from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
+from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states, libero_task
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task
 from pipeline.testset import benchmark
@@ -296,3 +298,13 @@ def test_a_list_of_tasks_is_checked(tmp_path: Path) -> None:
     assert select(Selection(file=file)) == [task]
     with pytest.raises(PipelineError, match="expected: clean"):
         select(Selection(file=file, axes=("camera",)))
+
+
+def test_an_environment_rejects_a_task_of_an_unknown_source_and_states_that_no_episode_has_begun() -> None:
+    environment = EpisodeEnvironment()
+    unknown = replace(libero_task(STOVE, 0), source="others")  # type: ignore[arg-type]
+    with pytest.raises(PipelineError, match="there is no source 'others' of tasks"):
+        environment.reset(unknown)
+    assert environment.progress.reason == "not_begun"
+    with pytest.raises(PipelineError, match="no episode has begun"):
+        environment.observation(Wanted())

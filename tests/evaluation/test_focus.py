@@ -14,13 +14,13 @@ from pipeline.axes import level_of_test
 from pipeline.commands.command_line import run
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
-from pipeline.evaluation.focus import PRIOR, Attempt, Focused, Limits, Reason, attempts, focus
+from pipeline.evaluation.analyses.focus import PRIOR, Attempt, Focused, Limits, Reason, attempts, focus
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.formats.rlds import RldsConfig
 from pipeline.libero.tasks import tasks
-from pipeline.planning.plan import apportion
+from pipeline.planning.apportion import apportion
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
 

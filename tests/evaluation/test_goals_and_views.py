@@ -14,12 +14,18 @@ from pipeline.axes.goal import GoalPerturbation, held_out
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.evaluate import not_trained
+from pipeline.evaluation.goals import (
+    CARRIED,
+    find_replacement,
+    leave_out_trained_goals,
+    list_replacements,
+    resolve_goal,
+)
 from pipeline.evaluation.harness import PerturbedLibero
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.tasks import CARRIED, EvaluationTask, find_replacement, goal_task, replacements
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
 from pipeline.libero.carried import carried, definition_of
 from pipeline.libero.tasks import SUITES, find_task, tasks
@@ -29,7 +35,7 @@ from pipeline.types import Floats
 
 def test_goals_are_replaced_by_what_fits_and_is_named_alone() -> None:
     def asked(suite: str, name: str) -> set[str]:
-        return {one.instruction for one in replacements(find_task(suite, name))}
+        return {one.instruction for one in list_replacements(find_task(suite, name))}
 
     # The wine bottle on top of the cabinet is a task of LIBERO.
     assert asked("libero_goal", "put_the_bowl_on_top_of_the_cabinet") == {"put the cream cheese on top of the cabinet"}
@@ -88,8 +94,8 @@ def test_held_out_pairs_are_goals_of_their_scenes() -> None:
             expected.add((suite, scene.name, f"{scene.name}_task_{task.name}_state0"))
     assert carried_to == expected
     assert len(expected) == 3
-    replaced = {goal_task(task)[1] for task in listed if CARRIED not in task.name}
-    assert not replaced & {goal_task(task)[1] for task in listed if CARRIED in task.name}
+    replaced = {resolve_goal(task)[1] for task in listed if CARRIED not in task.name}
+    assert not replaced & {resolve_goal(task)[1] for task in listed if CARRIED in task.name}
     assert {definition_of(carried(task, scene)).asked for task, scene in held_out("libero_object")} <= replaced
 
 
@@ -103,11 +109,11 @@ def test_goals_that_a_plan_trains_on_are_left_out(tmp_path: Path, capsys: pytest
     file.parent.mkdir()
     plan.write([plan.build_row(entry, (change,), 0, ReplayConfig())], file)
     wanted = select(Selection(source="goals", suites=("libero_object",)))
-    left = not_trained(wanted, file)
+    left = leave_out_trained_goals(wanted, file)
     (out,) = set(wanted) - set(left)
     assert (out.base, out.component) == (soup.name, "milk")
     assert capsys.readouterr().out == "left out, because the plan trains on them: 1 of 50 goals\n"
-    assert not_trained(wanted, None) == wanted
+    assert leave_out_trained_goals(wanted, None) == wanted
     selection = {"source": "goals", "suites": ["libero_object"]}
     assert len(PerturbedLibero(selection=selection, settings={"plan": str(file)}).get_tasks()) == len(left)
     capsys.readouterr()
@@ -154,7 +160,7 @@ GOALS = {"libero_spatial": 17, "libero_object": 50, "libero_goal": 12, "libero_1
 def test_every_prompt_is_a_plain_sentence_about_the_new_object_alone(suite: str) -> None:
     """Before, 6 of LIBERO-90's 115 were regular expressions, 4 still named the old object, 2 meant either of two kinds
     of books, and one put a mug in front of itself."""
-    asked = [(task, one) for task in tasks(suite) for one in replacements(task)]
+    asked = [(task, one) for task in tasks(suite) for one in list_replacements(task)]
     assert len(asked) == GOALS[suite]
     for task, one in asked:
         known = bddl.read(task.bddl_file)

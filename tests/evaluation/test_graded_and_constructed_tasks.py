@@ -13,8 +13,8 @@ from pipeline.axes import AXES
 from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out
-from pipeline.evaluation.construction import candidates, construct
-from pipeline.evaluation.grading import difficulty
+from pipeline.evaluation.analyses.construction import candidates, construct
+from pipeline.evaluation.analyses.grading import difficulty
 from pipeline.evaluation.held_out import OWN_AXES
 from pipeline.evaluation.results import EpisodeFiles, read
 from pipeline.evaluation.selection import Selection, select

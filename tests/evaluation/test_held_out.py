@@ -122,7 +122,7 @@ def test_perturbations_that_a_plan_has_are_sampled_again(tmp_path: Path) -> None
     assert "plan" not in EpisodeSettings().model_dump()
     environment = EpisodeEnvironment(settings)
     environment.reset(task)
-    (used,) = environment.perturbations
+    (used,) = environment.episode.perturbations
     assert used == sample_perturbation(task, 0, attempt=1)
     plan.write(
         [planned_row(task, sample_perturbation(task, 0, attempt=attempt)) for attempt in range(20)],
@@ -166,7 +166,7 @@ def test_a_held_out_camera_that_does_not_show_what_the_task_is_about_is_sampled_
     environment = EpisodeEnvironment()
     progress = environment.reset(task)
     assert progress.reason == "running"
-    (used,) = environment.perturbations
+    (used,) = environment.episode.perturbations
     environment.image("agentview")  # which sets OpenGL up
     things = ("porcelain_mug_1", "white_yellow_mug_1", "plate_1", "plate_2")
     first_px, used_px = pixels_of(things, (sample_perturbation(task, 0), used), environment)

@@ -16,9 +16,10 @@ from libero_environment import OffScreenRenderEnv
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment
 from pipeline.evaluation.environment import EpisodeSettings
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.gym_environment import PerturbedLiberoEnv, identity_options
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import read, reject_different, stored
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.tasks import STEP_LIMITS, tasks
@@ -97,7 +98,7 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
     for _ in range(2):
         for env in sharing:
             seen, _ = env.reset()
-            simulator, number = env._environment.simulator, env._environment.task.number
+            simulator, number = env._environment.simulator, env._environment.episode.task.number
             bowl = 1 + simulator.model.joint("akita_black_bowl_1_joint0").qposadr[0]
             np.testing.assert_allclose(
                 simulator.state[bowl:][:2], libero_states(STOVE)[number, bowl:][:2], atol=2e-3, err_msg=str(number)

@@ -40,7 +40,7 @@ def ours(address: str, look_every: int) -> int:
     with closing(Server(address, look_every=look_every)) as server:
         roll_out_policy(opened(), server, TASK)
     assert opened().progress.steps == STEPS
-    return opened().looks
+    return opened().episode.looks
 
 
 @cache
@@ -59,7 +59,7 @@ def harness(address: str, look_every: int) -> int:
 
     asyncio.run(run())
     assert benchmark._environment.progress.steps == STEPS
-    return benchmark._environment.looks
+    return benchmark._environment.episode.looks
 
 
 def recording(out: Path, chunk: int, keeps: bool) -> AbstractContextManager[str]:

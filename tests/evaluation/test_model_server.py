@@ -24,11 +24,12 @@ from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.harness import PerturbedLibero, ReplayServer
 from pipeline.evaluation.model_server import Server, warn_of_requests
 from pipeline.evaluation.policies import StateAngle
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
 from pipeline.evaluation.tasks import libero_task
 from pipeline.libero.tasks import STEP_LIMITS

@@ -17,10 +17,12 @@ from pipeline.compute.pool import loop
 from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.evaluate import check_settings, evaluate
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.evaluation import Evaluation
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles, EpisodeResult
-from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.setting_checks import check_settings
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.control_env import control_env
 from pipeline.types import Task, Trajectory

@@ -30,7 +30,8 @@ from pipeline.evaluation.held_out import PlannedPerturbations
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
-from pipeline.planning.plan import Row, Sampler
+from pipeline.planning.plan import Row
+from pipeline.planning.sampler import Sampler
 from pipeline.run.claim import claim_folder
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask

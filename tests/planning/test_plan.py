@@ -25,6 +25,8 @@ from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.planning import plan, selection
+from pipeline.planning.apportion import apportion
+from pipeline.planning.sampler import Sampler
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -90,7 +92,7 @@ def test_quotas_are_spread_evenly_and_twins_complete() -> None:
 def test_equal_weights_spread_evenly_with_the_first_ahead(wanted: int, number: int) -> None:
     """As plans before weights were spread: quotient for every task, and one more for as many as the remainder."""
     quotient, remainder = divmod(wanted, number)
-    assert plan.apportion(wanted, [1.0] * number) == [quotient + (place < remainder) for place in range(number)]
+    assert apportion(wanted, [1.0] * number) == [quotient + (place < remainder) for place in range(number)]
 
 
 @pytest.mark.parametrize(("wanted", "reserve", "candidates"), [(1, 0.3, 2), (4, 0.3, 6), (2, 0.5, 3), (3, 0.0, 3)])
@@ -222,9 +224,7 @@ def test_a_demonstration_without_further_perturbations_leaves_the_places_to_the_
     sampled = {
         demo.demo_id: {
             to_json(perturbations)
-            for perturbations in plan.Sampler("background", (few,), wanted.seed, NO_TESTS).sample(
-                demo.demo_id, demo.task
-            )
+            for perturbations in Sampler("background", (few,), wanted.seed, NO_TESTS).sample(demo.demo_id, demo.task)
         }
         for demo in demos
     }
@@ -258,7 +258,7 @@ def test_perturbations_that_overlap_with_a_test_task_are_sampled_again() -> None
 def test_levels_near_the_test_set_are_sampled_as_often_as_others() -> None:
     """Of level 1 here one scene in seven keeps clear of the benchmark's, of level 5 nearly each."""
     study = next(task for task in tasks("libero_10") if task.name.startswith("STUDY_SCENE1"))
-    samples = plan.Sampler("pose", (PoseAxis(),), 3, benchmark.load()).sample("demo_0", study)
+    samples = Sampler("pose", (PoseAxis(),), 3, benchmark.load()).sample("demo_0", study)
     levels = Counter(scene.level for (scene,) in islice(samples, 200))
     assert chisquare([levels[level] for level in LEVELS]).pvalue > 0.01
 
@@ -268,7 +268,7 @@ def test_a_rewrite_stays_where_its_camera_is_sampled_again() -> None:
     axes = (CameraAxis(), LanguageAxis())
     of = ("camera+language", axes, 3)
     number = len(list_rewrites(TASKS[0]))
-    first = [*islice(plan.Sampler(*of, NO_TESTS).sample("demo_0", TASKS[0]), number)]
+    first = [*islice(Sampler(*of, NO_TESTS).sample("demo_0", TASKS[0]), number)]
     names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
     planted = [
         TestTask(
@@ -276,7 +276,7 @@ def test_a_rewrite_stays_where_its_camera_is_sampled_again() -> None:
         )
         for camera, _ in first[::5]
     ]
-    again = [*islice(plan.Sampler(*of, TestSet(tuple(planted))).sample("demo_0", TASKS[0]), number)]
+    again = [*islice(Sampler(*of, TestSet(tuple(planted))).sample("demo_0", TASKS[0]), number)]
     assert sum(camera != other for (camera, _), (other, _) in zip(first, again, strict=True)) >= len(planted)
     assert [text for _, text in again] == [text for _, text in first]
     assert len({text for _, text in again}) == number
@@ -372,7 +372,7 @@ def test_a_combination_fills_a_quota_of_its_own() -> None:
     )
     assert {row.episode_id for row in alone} <= {row.episode_id for row in rows}
     sampled = [
-        next(plan.Sampler(name, (CameraAxis(),), 3, NO_TESTS).sample("demo_0", TASKS[0]))
+        next(Sampler(name, (CameraAxis(),), 3, NO_TESTS).sample("demo_0", TASKS[0]))
         for name in ("camera", "camera+noise")
     ]
     assert sampled[0] != sampled[1], "it has samples of its own"

@@ -14,7 +14,7 @@ from conftest import REPOSITORY
 
 from pipeline.axes.pose import PoseAxis, ScenePerturbation
 from pipeline.libero.tasks import find_task
-from pipeline.planning.plan import Sampler
+from pipeline.planning.sampler import Sampler
 from pipeline.testset import benchmark
 from pipeline.types import Floats, Task
 

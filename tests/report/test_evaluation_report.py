@@ -16,7 +16,7 @@ from scipy.stats import binomtest
 from pipeline import files
 from pipeline.axes import level_of_test
 from pipeline.errors import PipelineError
-from pipeline.evaluation.grading import grade
+from pipeline.evaluation.analyses.grading import grade
 from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read, stored
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import compare, mcnemar, paired

@@ -28,10 +28,10 @@ from vla_eval.results.export import export_eval
 from pipeline.axes import level_of_test
 from pipeline.commands.command_line import run as command
 from pipeline.errors import PipelineError
-from pipeline.evaluation.other_programs import read_tested
+from pipeline.evaluation.analyses.other_programs import read_tested
+from pipeline.evaluation.analyses.tested import Outcome, TestedPolicy
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.evaluation.tested import Outcome, TestedPolicy
 from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.report.paper_rows import HEADINGS, csv_text, latex, markdown
 from pipeline.report.paper_table import table_of

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.picture_fit import SIZE_PX
+from pipeline.evaluation.first_observation.picture_fit import SIZE_PX
 from pipeline.images.jpeg import resized
 from pipeline.types import Frame
 

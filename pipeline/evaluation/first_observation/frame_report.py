@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.frame_search import CLEAR, FEWEST_PX, Found, Match, middle, search
-from pipeline.evaluation.picture_fit import (
+from pipeline.evaluation.first_observation.frame_search import CLEAR, FEWEST_PX, Found, Match, middle, search
+from pipeline.evaluation.first_observation.picture_fit import (
     FITTING,
     SIZE_PX,
     UPRIGHT,
@@ -25,8 +25,8 @@ from pipeline.evaluation.picture_fit import (
     smoothed,
     variants,
 )
-from pipeline.evaluation.picture_points import place
-from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
+from pipeline.evaluation.first_observation.picture_points import place
+from pipeline.evaluation.first_observation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
 from pipeline.files import replaced
 from pipeline.images.jpeg import encode_exactly, resized
 from pipeline.libero.starts import SETTLING_STEPS

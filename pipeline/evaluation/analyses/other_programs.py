@@ -12,9 +12,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pipeline.axes import AXES
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
+from pipeline.evaluation.analyses.tested import Outcome, TestedPolicy, joined, limits_of, tested_policy
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.results import ACROSS, read
-from pipeline.evaluation.tested import Outcome, TestedPolicy, joined, limits_of, tested_policy
 from pipeline.files import read_json
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import STEP_LIMITS

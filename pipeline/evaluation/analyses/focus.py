@@ -22,15 +22,15 @@ from scipy.optimize import brentq
 from pipeline.axes import Axis, axes_of, level_of_test
 from pipeline.config import NAME, Config, read_content, validate
 from pipeline.errors import PipelineError
-from pipeline.evaluation.other_programs import separate
+from pipeline.evaluation.analyses.other_programs import separate
+from pipeline.evaluation.analyses.tested import Outcome
+from pipeline.evaluation.goals import find_carried_task
 from pipeline.evaluation.results import EpisodeResult, read
 from pipeline.evaluation.statistics import wilson
-from pipeline.evaluation.tasks import carried_task
-from pipeline.evaluation.tested import Outcome
 from pipeline.files import write as write_file
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import select_tasks
-from pipeline.planning.plan import apportion
+from pipeline.planning.apportion import apportion
 from pipeline.strict_yaml import dump
 from pipeline.testset import benchmark
 from pipeline.types import Floats
@@ -170,7 +170,7 @@ def _attempt(policy: str, row: EpisodeResult) -> Attempt | None:
         return _attempt_on_test(policy, row)
     task = f"{row.suite}/{row.base}"
     if row.source == "goals":
-        carried = carried_task(row)
+        carried = find_carried_task(row)
         if carried is None:
             return None
         task = str(carried)

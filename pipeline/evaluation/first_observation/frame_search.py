@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from pipeline.errors import RejectedError
-from pipeline.evaluation.picture_fit import Fit, Smooth, Variant, fit, smoothed, variants
-from pipeline.evaluation.picture_points import place
-from pipeline.evaluation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, StartFrames
+from pipeline.evaluation.first_observation.picture_fit import Fit, Smooth, Variant, fit, smoothed, variants
+from pipeline.evaluation.first_observation.picture_points import place
+from pipeline.evaluation.first_observation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, StartFrames
 from pipeline.libero import bddl
 from pipeline.libero import tasks as libero_tasks
 from pipeline.libero.starts import SETTLING_STEPS

@@ -1,0 +1,239 @@
+"""Sampling of a plan's perturbations: different ones for a demonstration, each at its clearance from all test tasks."""
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import NamedTuple
+
+from pipeline.axes import Axis, Perturbation, TextPerturbation, from_json
+from pipeline.errors import PipelineError
+from pipeline.libero.demonstrations import DemoEntry
+from pipeline.seeding import digest, rng
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Task
+
+_ATTEMPTS = 100
+"""Number of samples after which no different, or no clear, perturbation counts as possible."""
+
+
+class TakenEntries:
+    """Counts of the list entries that the candidates of one task have taken, for axes that take entries of lists.
+
+    A candidate takes one of the entries that the fewest earlier candidates have; its key decides between them. All
+    entries are therefore used once before any is used again. An additional demonstration changes few entries of the
+    other demonstrations.
+    """
+
+    def __init__(self) -> None:
+        """Start without any taken entry."""
+        self._times: Counter[str] = Counter()
+
+    def order(self, entries: Sequence[str], key: str) -> list[int]:
+        """Return the places of the entries in the order in which a candidate tries them; [0] for an empty list."""
+        if not entries:
+            return [0]
+
+        def rank(place: int) -> tuple[int, str]:
+            entry = entries[place]
+            return self._times[entry], digest(key, entry)
+
+        return sorted(range(len(entries)), key=rank)
+
+    def take(self, entries: Sequence[str], place: int) -> None:
+        """Count the entry at ``place`` as taken by a candidate."""
+        if entries:
+            self._times[entries[place]] += 1
+
+
+class _Choice(NamedTuple):
+    """First sample of an axis.
+
+    Attributes:
+        task: the task that the axis perturbs, which an earlier axis may have carried to another scene.
+        earlier: perturbations that the episode's start has from an expansion; none if the episode starts from a reset.
+        place: index into the axis's ``entries``.
+    """
+
+    axis: Axis
+    task: Task
+    earlier: Sequence[Perturbation]
+    place: int
+    perturbation: Perturbation
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """Source of perturbations for a plan's episodes of one axis or combination.
+
+    Attributes:
+        name: name of the axis or combination, as in ``plan.episodes``.
+        axes: axes to sample from.
+        seed: seed of the plan.
+        test: the benchmark's tasks, to which perturbations keep their clearance.
+    """
+
+    name: str
+    axes: Sequence[Axis]
+    seed: int
+    test: TestSet
+
+    def sample(
+        self, demo_id: str, task: Task, taken: TakenEntries | None = None, expanded_by: str = "[]"
+    ) -> Iterator[tuple[Perturbation, ...]]:
+        """Sample for one demonstration, variant after variant: all different, and each at its clearance from all tests.
+
+        Args:
+            taken: list entries that other demonstrations of the task have taken; no entries by default.
+            expanded_by: JSON of the perturbations with which an expansion generated the demonstration.
+
+        Yields:
+            One perturbation of each axis, until no different one is left.
+
+        Raises:
+            PipelineError: when another version with other perturbations generated the demonstration.
+        """
+        earlier = _read_earlier(demo_id, expanded_by)
+        taken = taken or TakenEntries()
+        contents: set[tuple[str, ...]] = set()
+        for variant in count():
+            new = self._sample_new(task, taken, earlier, (demo_id, variant), contents)
+            if new is None:
+                return
+            choices, perturbations = new
+            contents.add(_content_of(perturbations))
+            for choice in choices:
+                taken.take(choice.axis.entries(choice.task), choice.place)
+            yield perturbations
+
+    def _sample_new(
+        self,
+        task: Task,
+        taken: TakenEntries,
+        earlier: Sequence[Perturbation],
+        key: tuple[str | int, ...],
+        contents: Collection[tuple[str, ...]],
+    ) -> tuple[list[_Choice], tuple[Perturbation, ...]] | None:
+        """Sample one perturbation of each axis, different from those of all earlier variants.
+
+        Args:
+            contents: contents of the earlier variants, see ``_content_of``.
+
+        Returns:
+            The choices and the perturbations; ``None`` if no attempt gives different perturbations that are clear.
+        """
+        for attempt in range(_ATTEMPTS):
+            choices = self._sample_axes(task, attempt, taken, earlier, key)
+            perturbations = self._sample_all_clear(choices, (*key, attempt))
+            if perturbations and _content_of(perturbations) not in contents:
+                return choices, perturbations
+        return None
+
+    def _sample_axes(
+        self, task: Task, attempt: int, taken: TakenEntries, earlier: Sequence[Perturbation], key: tuple[str | int, ...]
+    ) -> list[_Choice]:
+        """Sample one perturbation of each axis, in the order in which they apply."""
+        # One generator samples all first perturbations. Each axis that samples again uses a generator of its own.
+        random = rng(self.seed, self.name, *key, attempt)
+        choices: list[_Choice] = []
+        for axis in self.axes:
+            turn = taken.order(axis.entries(task), digest(self.seed, self.name, *key))
+            place = turn[attempt % len(turn)]
+            perturbation = axis.sample_after(random, task, place, earlier)
+            choices.append(_Choice(axis, task, earlier, place, perturbation))
+            task = perturbation.played(task)
+            if perturbation.reset_seed is not None:
+                earlier = ()
+        return choices
+
+    def _sample_all_clear(
+        self, choices: Sequence[_Choice], key: tuple[str | int, ...]
+    ) -> tuple[Perturbation, ...] | None:
+        """Return one perturbation of each choice, or ``None`` if an axis has none that is clear."""
+        texts = [choice.perturbation for choice in choices]
+        instruction = " ".join(change.apply("") for change in texts if isinstance(change, TextPerturbation))
+        perturbations = []
+        for number, choice in enumerate(choices):
+            clear = self._sample_clear(choice, instruction, (*key, number))
+            if clear is None:
+                return None
+            perturbations.append(clear)
+        return tuple(perturbations)
+
+    def _sample_clear(self, choice: _Choice, instruction: str, key: tuple[str | int, ...]) -> Perturbation | None:
+        """Return the chosen perturbation if it is clear, else sample a clear one of its component and level.
+
+        A clear perturbation keeps its clearance to the test set, unless the axis keeps none, and the ``instruction``
+        does not name it. Component and level are kept because strengths near the test set's would otherwise become
+        rare.
+
+        Returns:
+            The perturbation. ``None`` if many attempts give no clear one, or if the axis takes the entries of a list:
+            the caller then tries the next entry.
+        """
+        axis, task, first = choice.axis, choice.task, choice.perturbation
+
+        def is_clear(perturbation: Perturbation) -> bool:
+            if perturbation.named_in(instruction):
+                return False
+            nearest = perturbation.nearest(self.test, task)
+            return nearest.distance >= perturbation.clearance or not axis.keeps_clearance
+
+        if is_clear(first):
+            return first
+        if axis.entries(task):
+            return None
+        random = rng(self.seed, self.name, *key)
+        axis_at_level = axis.model_copy(update={"levels": (first.level,)})
+        for _ in range(_ATTEMPTS):
+            perturbation = axis_at_level.sample_after(random, task, 0, choice.earlier)
+            is_alike = (perturbation.component, perturbation.level) == (first.component, first.level)
+            if is_alike and is_clear(perturbation):
+                return perturbation
+        return None
+
+
+def _content_of(perturbations: Sequence[Perturbation]) -> tuple[str, ...]:
+    """Return the content of each perturbation as JSON; equal perturbations have equal content."""
+    return tuple(perturbation.model_dump_json() for perturbation in perturbations)
+
+
+def _read_earlier(demo_id: str, expanded_by: str) -> tuple[Perturbation, ...]:
+    """Read the perturbations with which an expansion generated a demonstration.
+
+    Raises:
+        PipelineError: when another version with other perturbations generated it.
+    """
+    try:
+        return tuple(from_json(expanded_by))
+    except PipelineError as error:
+        raise PipelineError(
+            f"the perturbations of this expanded demonstration cannot be read ({error.what})",
+            where=demo_id,
+            expected="perturbations of this version",
+            remedy="expand the human demonstrations again into another folder",
+        ) from error
+
+
+def sample_candidates(
+    sampler: Sampler, demos: Sequence[DemoEntry]
+) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:
+    """Sample a task's candidates: the first variant of every demonstration, then the second of every one, and so on.
+
+    A demonstration without further different perturbations is skipped. The candidates end when all demonstrations are
+    skipped.
+
+    Yields:
+        Demonstration, perturbations and number of the variant.
+    """
+    taken = TakenEntries()
+    samples = {demo: sampler.sample(demo.demo_id, demo.task, taken, demo.perturbations) for demo in demos}
+    for variant in count():
+        for demo, samples_of_demo in [*samples.items()]:
+            perturbations = next(samples_of_demo, None)
+            if perturbations is None:
+                del samples[demo]
+            else:
+                yield demo, perturbations, variant
+        if not samples:
+            return
