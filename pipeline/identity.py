@@ -146,6 +146,11 @@ ALLOW = f"put `{REMAKE}=1` before the command, or --remake after the command of 
 """Ways to allow that a stage generates finished files again, in words."""
 
 
+def remake_allowed() -> bool:
+    """Return whether ``REMAKE=1`` permits this command to generate finished work again."""
+    return os.environ.get(REMAKE) == "1"
+
+
 def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
     """Report the finished files that would be generated again, and stop unless a person allowed it.
 
@@ -160,7 +165,7 @@ def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
     if not found:
         return
     outdated = "; ".join(f"{number} {kind}" for kind, number in found.items())
-    if os.environ.get(REMAKE) == "1":
+    if remake_allowed():
         print(f"generating again: {outdated}")
         return
     raise PipelineError(

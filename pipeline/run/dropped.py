@@ -4,13 +4,12 @@ The stages ``plan``, ``replay`` and ``render`` call ``reject_deletion`` before t
 ``status`` and ``doctor`` report the result of ``measure``.
 """
 
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 from pipeline.errors import PipelineError
-from pipeline.identity import ALLOW, REMAKE
+from pipeline.identity import ALLOW, remake_allowed
 from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
 from pipeline.planning.streams import streams_of
@@ -111,7 +110,7 @@ def reject_deletion(rows: Sequence[plan.Row], run: Run) -> None:
         PipelineError: when the share is above ``LARGEST_SHARE`` and ``REMAKE=1`` is not set. Nothing was changed.
     """
     dropped = measure(rows, run)
-    if dropped.asks and os.environ.get(REMAKE) != "1":
+    if dropped.asks and not remake_allowed():
         raise PipelineError(
             f"the run would delete finished work that the configuration no longer needs: {dropped}",
             where=run.folder,

@@ -34,7 +34,7 @@ from pipeline.files import (
 )
 from pipeline.formats.base import AnyFormat, DatasetRecord
 from pipeline.formats.episodes import EpisodeFacts, Episodes, Load, Piece
-from pipeline.identity import ALLOW, REMAKE, reject_unasked
+from pipeline.identity import ALLOW, reject_unasked, remake_allowed
 from pipeline.record import Basis
 from pipeline.run.layout import DATASETS, WORK
 from pipeline.run.outcome import shuffled
@@ -160,7 +160,7 @@ def _edits_to_replace(target: AnyFormat, record_file: Path) -> list[Path]:
         file = target.folder / name
         if file.is_file() and checksum(file) != sha256:
             changed.append(file)
-    if changed and os.environ.get(REMAKE) != "1":
+    if changed and not remake_allowed():
         raise PipelineError(
             f"the file was edited or damaged, and would be replaced ({len(changed)} such files)",
             where=changed[0],
@@ -194,7 +194,7 @@ def _unknown_to_replace(target: AnyFormat, work: Path) -> list[Path]:
             replaced_files.append(file)
     if foreign:
         raise _foreign_entries_error(target, foreign, {name.partition("/")[0] for name in (*recorded, *new)})
-    if replaced_files and os.environ.get(REMAKE) != "1":
+    if replaced_files and not remake_allowed():
         raise PipelineError(
             f"no record of an export lists the file, and it would be replaced ({len(replaced_files)} such files)",
             where=replaced_files[0],
