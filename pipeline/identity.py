@@ -84,7 +84,7 @@ REMAKE = "REMAKE"
 """Environment variable that permits a command, as ``REMAKE=1`` before it, to generate finished work again.
 
 It also permits to delete finished work that a changed plan no longer needs, and demonstrations of an earlier
-``demos expand``. It never deletes a user's file: edited and unrecorded files of a dataset, and edited folders ``card``
+``demos expand``. It never deletes a user's file: edited and foreign files of a dataset, and edited folders ``card``
 and ``finetune``, are moved to a folder of a new name.
 """
 

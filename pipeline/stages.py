@@ -21,7 +21,7 @@ from pipeline.formats.episodes import by_suite
 from pipeline.formats.rlds import Rlds
 from pipeline.identity import reject_unasked
 from pipeline.planning import leakage, plan
-from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
+from pipeline.run import counts, dataset_files, dropped, export, finished, inputs, machine, manifest, plan_stage
 from pipeline.run.claim import claim_folder, locked
 from pipeline.run.cleaning import say_stale
 from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
@@ -202,7 +202,7 @@ def _export(group: str) -> Stage:
         if not run.path(DATASETS).exists():
             return run.path(DATASETS)
         datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
-        return next(filter(None, map(export.changed_file, datasets)), None)
+        return next(filter(None, map(dataset_files.changed_file, datasets)), None)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
     records_of_failures = [f"{FAILURES}/{record}" for record in records]

@@ -14,7 +14,7 @@ from pipeline.errors import PipelineError
 from pipeline.generated import FOLDERS, edits, edits_in_words
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
-from pipeline.run import cleaning, counts, dropped, export, finished, machine, outcome, plan_stage
+from pipeline.run import cleaning, counts, dataset_basis, dataset_files, dropped, finished, machine, outcome, plan_stage
 from pipeline.run.outcome import outdated
 from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
@@ -154,13 +154,13 @@ def _outdated(run: Run, names: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 def _stale_datasets(run: Run) -> Iterator[tuple[str, str]]:
     for dataset in (*run.formats, *(run.failure_formats if run.outcome.failures else ())):
-        episodes = export.episodes_of(dataset, run)
-        changed_file = export.changed_file(dataset)
+        episodes = dataset_basis.episodes_of(dataset, run)
+        changed_file = dataset_files.changed_file(dataset)
         if changed_file is not None:
             why = finished.missing_or_changed(changed_file, run.folder)
-        elif not dataset.record().matches(export.compute_basis(dataset, episodes)):
-            reason = next(iter(export.outdated(dataset, episodes)), "files of other episodes or with other options")
-            why = f"the dataset has {reason}"
+        elif not dataset.record().matches(dataset_basis.compute_basis(dataset, episodes)):
+            reasons = dataset_basis.outdated(dataset, episodes)
+            why = f"the dataset has {next(iter(reasons), 'files of other episodes or with other options')}"
         else:
             continue
         yield f"export_{dataset.group}", f"{dataset.title}: {why}"

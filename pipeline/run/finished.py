@@ -23,7 +23,7 @@ from pipeline.files import checksum, read_json, write_json
 from pipeline.formats.registry import FORMATS
 from pipeline.identity import RECIPES, Step, made_with, versions
 from pipeline.record import Basis, Record
-from pipeline.run.export import changed_file
+from pipeline.run.dataset_files import changed_file
 from pipeline.run.layout import (
     COUNTS,
     FINISHED,
