@@ -1,13 +1,16 @@
 """The time left: what several episodes share is made once."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from conftest import BOWL
 
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.episode_schema import STANDARD
+from pipeline.export_config import ExportConfig
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
+from pipeline.run.progress import Progress
 from pipeline.status import not_made
 from pipeline.stores.frame_store import StoredFrames
 from pipeline.testset.benchmark import TestSet
@@ -24,15 +27,17 @@ def test_what_is_left_is_counted_in_trajectories_and_streams() -> None:
     assert len(rows) == 15
     twin = rows[0].trajectory_id
     verdicts = {twin: Verdict(True, "kept")}
-    assert not_made(rows, {}, {}, STANDARD.views) == {"replay": 1.0, "render": 1.0}
+
+    def progress(rows: list[plan.Row], frames: Mapping[str, StoredFrames]) -> Progress:
+        return Progress(rows, verdicts if frames else {}, frames, {}, STANDARD.views, ExportConfig())
+
+    assert not_made(progress(rows, {}), rows) == {"replay": 1.0, "render": 1.0}
     streams = {stream.stream_id for stream in streams_of(rows[0].perturbations).values()}
     # Both views of the twin and of the robot's start, and a moved agent view for each camera, which is all 9 change.
-    left = not_made(rows, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)}, STANDARD.views)
+    frames = {twin: StoredFrames("", "", "open_loop", "", streams)}
+    left = not_made(progress(rows, frames), rows)
     assert left["replay"] == 0.5
     moved = {one.stream_id for row in rows if row.axis == "camera" for one in streams_of(row.perturbations).values()}
     assert left["render"] == (len(moved - streams) + 2) / (len(moved | streams) + 2)
     alone = [replace(row, trajectory_id=twin) for row in rows if row.axis == "language"]
-    assert not_made(alone, verdicts, {twin: StoredFrames("", "", "open_loop", "", streams)}, STANDARD.views) == {
-        "replay": 0.0,
-        "render": 0.0,
-    }
+    assert not_made(progress(alone, frames), alone) == {"replay": 0.0, "render": 0.0}
