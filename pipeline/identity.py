@@ -164,7 +164,7 @@ def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
     """
     if not found:
         return
-    outdated = "; ".join(f"{number} {kind}" for kind, number in found.items())
+    outdated = describe_outdated(found)
     if remake_allowed():
         print(f"generating again: {outdated}")
         return
@@ -174,6 +174,11 @@ def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
         expected="the recipes, packages, machine code and OpenGL device that generated it",
         remedy=f"use the version and the machine that generated it, or allow the change: {allow}",
     )
+
+
+def describe_outdated(found: Counter[str]) -> str:
+    """List numbers of files, each with their kind and the reason."""
+    return "; ".join(f"{number} {kind}" for kind, number in found.items())
 
 
 @cache

@@ -43,7 +43,7 @@ from pipeline.run.layout import (
     SHEETS,
     STATISTICS,
 )
-from pipeline.run.outcome import outdated
+from pipeline.run.outcome import join_kinds, outdated
 from pipeline.run.render_stage import render_and_replace
 from pipeline.run.replay_stage import Replays
 from pipeline.run.rewrites import list_episode_rewrites
@@ -149,7 +149,7 @@ def replay(run: Run) -> None:
     """Replay and judge every planned trajectory, without OpenGL; a stopped stage resumes."""
     rows, config = run.plan, run.config
     plan.reject_other_settings(rows, config.replay)
-    reject_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
+    reject_unasked(join_kinds(outdated(rows, run.trajectories, run.frames)), run.folder)
     dropped.reject_deletion(rows, run)
     with run.workers() as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
@@ -169,7 +169,8 @@ def render(run: Run) -> None:
     print(gl.choose())
     rows, config = run.plan, run.config
     plan.reject_other_settings(rows, config.replay)
-    reject_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
+    outdated_files = outdated(rows, run.trajectories, run.frames, gl.choose().device)
+    reject_unasked(join_kinds(outdated_files), run.folder)
     dropped.reject_deletion(rows, run)
     # The configuration may have changed since the plan was written.
     config.export.reject_too_few(plan.count_demonstrations(rows))

@@ -24,6 +24,9 @@ LEFT_OUT = "left_out"
 SUCCESS_REASONS = ("kept", LEFT_OUT)
 """Reasons of episodes whose trajectory and frames are stored."""
 
+REPLAYS, RENDERINGS = "trajectories", "files of frames"
+"""Kinds of stored files."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -127,8 +130,8 @@ def _reject_missing(missing: Sequence[Path], stage: str) -> None:
 
 def outdated(
     rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: FrameStore, device: str | None = None
-) -> Counter[str]:
-    """Count the stored files of a plan that this version, or this machine, would generate again, by reason.
+) -> dict[str, Counter[str]]:
+    """Count the stored files of a plan that this version, or this machine, would generate again, by kind and reason.
 
     The count includes finished files of today's plan, with today's settings, that were generated with other recipes,
     packages, machine code or another OpenGL device: see ``identity.reject_unasked``. Files that a changed
@@ -136,14 +139,23 @@ def outdated(
 
     Args:
         device: OpenGL name of the device that renders here; without it, frames of any device count as finished.
+
+    Returns:
+        ``REPLAYS`` and ``RENDERINGS``, if there are such files, to the number of files for each reason.
     """
     planned = dict.fromkeys(row.trajectory_id for row in rows)
-    by_kind = {
-        "trajectories": trajectories.outdated(planned),
-        "files of frames": frames.outdated_of(planned, device),
-    }
+    by_kind = {REPLAYS: trajectories.outdated(planned), RENDERINGS: frames.outdated_of(planned, device)}
+    return {kind: reasons for kind, reasons in by_kind.items() if reasons}
+
+
+def join_kinds(outdated_files: Mapping[str, Counter[str]]) -> Counter[str]:
+    """Map descriptions of kind and reason to numbers of files.
+
+    Args:
+        outdated_files: as returned by ``outdated``.
+    """
     numbers: Counter[str] = Counter()
-    for kind, reasons in by_kind.items():
+    for kind, reasons in outdated_files.items():
         for reason, number in reasons.items():
             numbers[f"{kind}, generated with {reason}"] += number
     return numbers

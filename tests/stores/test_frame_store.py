@@ -23,7 +23,7 @@ from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.render import render
 from pipeline.rendering.renderer import LastScene
-from pipeline.run.outcome import outdated
+from pipeline.run.outcome import join_kinds, outdated
 from pipeline.run.progress import rejections
 from pipeline.run.render_job import RenderJob
 from pipeline.run.render_stage import STREAMS_OF_A_JOB, portions, render_plan
@@ -103,13 +103,13 @@ def test_finished_work_is_generated_again_only_where_that_was_allowed(
     next_recipe(step)
     number = f"recipe of {step} {identity.RECIPES[step] - 1}, here {identity.RECIPES[step]}"
     found = outdated(rows, TrajectoryStore(stored.root), FrameStore(store.root, config.render))
-    told = {f"files of frames, generated with {number}": 1}
-    assert found == told | ({f"trajectories, generated with {number}": 1} if step == "physics" else {})
+    told = {"files of frames": {number: 1}}
+    assert found == told | ({"trajectories": {number: 1}} if step == "physics" else {})
     with pytest.raises(PipelineError, match=rf"1 files of frames, generated with {number}(?s:.*)REMAKE=1` before"):
-        identity.reject_unasked(found, tmp_path)
+        identity.reject_unasked(join_kinds(found), tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
     monkeypatch.setenv(identity.REMAKE, "1")
-    identity.reject_unasked(found, tmp_path)
+    identity.reject_unasked(join_kinds(found), tmp_path)
     assert number in capsys.readouterr().out
     if step == "pixels":
         monkeypatch.delenv(identity.REMAKE)
@@ -130,7 +130,7 @@ def test_what_the_user_changed_is_made_without_a_question(
     assert not changed.rows()
     assert not outdated(rows, stored, changed, gl.choose().device)
     device = outdated(rows, stored, store, "another device")
-    assert device == {f"files of frames, generated with OpenGL device {gl.choose().device}, here another device": 1}
+    assert device == {"files of frames": {f"OpenGL device {gl.choose().device}, here another device": 1}}
     assert not outdated([], stored, store), "a file that no episode of today's plan needs"
 
 
