@@ -24,9 +24,14 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline import origins
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.files import checksum
 from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
+
+LIBRARY = Path(__file__).parent
+"""Folder of this package."""
 
 Step = Literal["physics", "pixels", "encoding", "evaluation", "checks", "pictures"]
 
@@ -179,6 +184,14 @@ def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
 def describe_outdated(found: Counter[str]) -> str:
     """List numbers of files, each with their kind and the reason."""
     return "; ".join(f"{number} {kind}" for kind, number in found.items())
+
+
+@cache
+def digest_library() -> str:
+    """Return a digest of every file of this package, and of the schema of an episode."""
+    files = [file for file in sorted(LIBRARY.rglob("*")) if file.is_file() and "__pycache__" not in file.parts]
+    content = {file.relative_to(LIBRARY).as_posix(): checksum(file) for file in files}
+    return digest(content, SCHEMA.model_dump(mode="json"))
 
 
 @cache
