@@ -38,7 +38,7 @@ class Result:
     reason: Annotated[
         str,
         "kept, or the reason for dropping; of the replay: goal_not_reached, goal_lost, too_short, simulation_unstable, "
-        "scene_refused, state_mismatch, worker_lost, no_reference, not_replayed, the reason of a rejected physics "
+        "scene_refused, state_mismatch, worker_lost, no_reference, the reason of a rejected physics "
         "perturbation, or the column beyond a limit of `filter`; of the frames: too_dark, blown_out, "
         "task_object_not_seen, hand_not_seen, added_objects_not_seen, camera_missing, worker_lost; of the selection: "
         "reserve_not_needed, left_out (by export.where)",
