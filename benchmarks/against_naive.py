@@ -30,7 +30,7 @@ from pipeline.machine_code import MACHINE_CODE_VARIABLES, ensure_fixed_machine_c
 from pipeline.physics.environment import DUMMY_ACTION
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
-from pipeline.run.outcome import rejections
+from pipeline.run.progress import rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.stores.frame_store import FrameStore, frames_by_trajectory

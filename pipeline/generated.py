@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import checksum, read_json, remove, replaced, unused_name, write_json
-from pipeline.identity import ALLOW, REMAKE
+from pipeline.identity import ALLOW, remake_allowed
 from pipeline.record import Basis, Record
 
 RECORD = ".generated.json"
@@ -184,7 +184,7 @@ def _lost_edits(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
         same = file.is_file() and not file.is_symlink() and checksum(file) == files.get(path)
         if not same:
             lost[path] = how
-    if not lost or os.environ.get(REMAKE) == "1":
+    if not lost or remake_allowed():
         return lost
     raise PipelineError(
         f"{len(lost)} edited files would be overwritten or deleted: {in_words(lost)}",

@@ -24,9 +24,14 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline import origins
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.files import checksum
 from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
+
+LIBRARY = Path(__file__).parent
+"""Folder of this package."""
 
 Step = Literal["physics", "pixels", "encoding", "evaluation", "checks", "pictures"]
 
@@ -84,7 +89,7 @@ REMAKE = "REMAKE"
 """Environment variable that permits a command, as ``REMAKE=1`` before it, to generate finished work again.
 
 It also permits to delete finished work that a changed plan no longer needs, and demonstrations of an earlier
-``demos expand``. It never deletes a user's file: edited and unrecorded files of a dataset, and edited folders ``card``
+``demos expand``. It never deletes a user's file: edited and foreign files of a dataset, and edited folders ``card``
 and ``finetune``, are moved to a folder of a new name.
 """
 
@@ -146,6 +151,11 @@ ALLOW = f"put `{REMAKE}=1` before the command, or --remake after the command of 
 """Ways to allow that a stage generates finished files again, in words."""
 
 
+def remake_allowed() -> bool:
+    """Return whether ``REMAKE=1`` permits this command to generate finished work again."""
+    return os.environ.get(REMAKE) == "1"
+
+
 def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
     """Report the finished files that would be generated again, and stop unless a person allowed it.
 
@@ -159,8 +169,8 @@ def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
     """
     if not found:
         return
-    outdated = "; ".join(f"{number} {kind}" for kind, number in found.items())
-    if os.environ.get(REMAKE) == "1":
+    outdated = describe_outdated(found)
+    if remake_allowed():
         print(f"generating again: {outdated}")
         return
     raise PipelineError(
@@ -169,6 +179,19 @@ def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
         expected="the recipes, packages, machine code and OpenGL device that generated it",
         remedy=f"use the version and the machine that generated it, or allow the change: {allow}",
     )
+
+
+def describe_outdated(found: Counter[str]) -> str:
+    """List numbers of files, each with their kind and the reason."""
+    return "; ".join(f"{number} {kind}" for kind, number in found.items())
+
+
+@cache
+def digest_library() -> str:
+    """Return a digest of every file of this package, and of the schema of an episode."""
+    files = [file for file in sorted(LIBRARY.rglob("*")) if file.is_file() and "__pycache__" not in file.parts]
+    content = {file.relative_to(LIBRARY).as_posix(): checksum(file) for file in files}
+    return digest(content, SCHEMA.model_dump(mode="json"))
 
 
 @cache

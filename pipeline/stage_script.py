@@ -27,7 +27,7 @@ def perform_stage(script: str) -> None:
     parser.add_argument("config", type=Path, help="configuration file, such as configs/starter.yaml")
     remake = (
         "allow generating finished work again, deleting finished work that is no longer needed, and moving edited "
-        f"or unrecorded files out of a dataset that is replaced, as {REMAKE}=1"
+        f"or foreign files out of a dataset that is replaced, as {REMAKE}=1"
     )
     parser.add_argument("--remake", action="store_true", help=remake)
     arguments = parser.parse_args()

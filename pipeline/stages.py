@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -21,7 +22,7 @@ from pipeline.formats.episodes import by_suite
 from pipeline.formats.rlds import Rlds
 from pipeline.identity import reject_unasked
 from pipeline.planning import leakage, plan
-from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
+from pipeline.run import counts, dataset_files, dropped, export, finished, inputs, machine, manifest, plan_stage
 from pipeline.run.claim import claim_folder, locked
 from pipeline.run.cleaning import say_stale
 from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
@@ -43,7 +44,7 @@ from pipeline.run.layout import (
     SHEETS,
     STATISTICS,
 )
-from pipeline.run.outcome import outdated
+from pipeline.run.outcome import join_kinds, outdated
 from pipeline.run.render_stage import render_and_replace
 from pipeline.run.replay_stage import Replays
 from pipeline.run.rewrites import list_episode_rewrites
@@ -106,11 +107,13 @@ def doctor(run: Run) -> None:
             where=run.folder,
             remedy="follow the remedies of the failed checks above, and run the command again",
         )
+    if tried and machine.known_speed(run) is not None:
+        return
+    trial = machine.trial()
     if not tried:
-        machine.record(run, machine.trial().digests)
+        machine.record(run, trial.digests)
         finished.trial_memory(run, gl.choose().device).keep()
-    if not tried or machine.known_speed(run) is None:
-        machine.keep_speed(run, machine.trial().speed)
+    machine.keep_speed(run, trial.speed)
 
 
 def make_plan(run: Run) -> None:
@@ -149,7 +152,7 @@ def replay(run: Run) -> None:
     """Replay and judge every planned trajectory, without OpenGL; a stopped stage resumes."""
     rows, config = run.plan, run.config
     plan.reject_other_settings(rows, config.replay)
-    reject_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
+    reject_unasked(join_kinds(outdated(rows, run.trajectories, run.frames)), run.folder)
     dropped.reject_deletion(rows, run)
     with run.workers() as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
@@ -169,7 +172,8 @@ def render(run: Run) -> None:
     print(gl.choose())
     rows, config = run.plan, run.config
     plan.reject_other_settings(rows, config.replay)
-    reject_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
+    outdated_files = outdated(rows, run.trajectories, run.frames, gl.choose().device)
+    reject_unasked(join_kinds(outdated_files), run.folder)
     dropped.reject_deletion(rows, run)
     # The configuration may have changed since the plan was written.
     config.export.reject_too_few(plan.count_demonstrations(rows))
@@ -202,11 +206,17 @@ def _export(group: str) -> Stage:
         if not run.path(DATASETS).exists():
             return run.path(DATASETS)
         datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
-        return next(filter(None, map(export.changed_file, datasets)), None)
+        return next(filter(None, map(dataset_files.changed_file, datasets)), None)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
     records_of_failures = [f"{FAILURES}/{record}" for record in records]
-    return Stage(write_datasets, _LABELLED, (INPUTS, *_OUTCOME), (*records, *records_of_failures), changed_file)
+    return Stage(
+        work=write_datasets,
+        settings=_LABELLED,
+        inputs=(INPUTS, *_OUTCOME),
+        outputs=(*records, *records_of_failures),
+        changed_file=changed_file,
+    )
 
 
 def write_manifest(run: Run) -> None:
@@ -220,16 +230,22 @@ def write_manifest(run: Run) -> None:
         lambda row: list_episode_rewrites(config.plan.axes.language, row.suite, row.task, row.perturbations),
     )
     manifest.write(table, run.manifest_file, manifest.Settings.of(config))
-
-    row_of = outcome.row_of
-    trajectory_of = {episode_id: row_of[episode_id].trajectory_id for episode_id in outcome.kept}
-    motions = {name: run.frames.motion(name) for name in {*trajectory_of.values()}}
-    suites = {episode_id: row_of[episode_id].suite for episode_id in outcome.kept}
-    figures = {}
-    for name, members in by_suite(suites, (config.export.options_for(Rlds) or config.export).name).items():
-        figures[name] = exact_statistics.openvla([motions[trajectory_of[episode_id]] for episode_id in members])
-    write_json(run.path(STATISTICS), figures)
+    write_json(run.path(STATISTICS), _openvla_statistics(run))
     write_json(run.path(COUNTS), counts.by_axis_and_suite(table.to_pylist()))
+
+
+def _openvla_statistics(run: Run) -> dict[str, Any]:
+    """Map the name of each suite's dataset to the statistics of its kept episodes for OpenVLA-OFT."""
+    kept = {episode_id: run.outcome.row_of[episode_id] for episode_id in run.outcome.kept}
+    # Episodes of a trajectory have the same motion, which is read once.
+    motions = {name: run.frames.motion(name) for name in {row.trajectory_id for row in kept.values()}}
+    suites = {episode_id: row.suite for episode_id, row in kept.items()}
+    dataset_name = (run.config.export.options_for(Rlds) or run.config.export).name
+    statistics = {}
+    for name, episode_ids in by_suite(suites, dataset_name).items():
+        motions_of_suite = [motions[kept[episode_id].trajectory_id] for episode_id in episode_ids]
+        statistics[name] = exact_statistics.openvla(motions_of_suite)
+    return statistics
 
 
 def validate(run: Run) -> None:
@@ -329,31 +345,43 @@ _LABELLED = ("filter", "export", "plan")
 """Settings of stages that list rewrites: they depend on the plan's language axis and, by ``INPUTS``, on the bank."""
 
 STAGES = {
-    "inputs": Stage(write_inputs),
-    "doctor": Stage(doctor, (*inputs.SECTIONS, "host"), (INPUTS,), (MACHINE,)),
-    "plan": Stage(make_plan, memory=plan_stage.memory),
-    "leakage": Stage(check_leakage, (), (PLAN,), (LEAKAGE,)),
+    "inputs": Stage(work=write_inputs),
+    "doctor": Stage(work=doctor, settings=(*inputs.SECTIONS, "host"), inputs=(INPUTS,), outputs=(MACHINE,)),
+    "plan": Stage(work=make_plan, memory=plan_stage.memory),
+    "leakage": Stage(work=check_leakage, inputs=(PLAN,), outputs=(LEAKAGE,)),
     "replay": Stage(
-        replay,
-        ("demos", "replay", "filter"),
-        (INPUTS, MACHINE, PLAN, LEAKAGE),
-        (REPLAY, TRAJECTORIES_TABLE),
-        _changed_replay,
+        work=replay,
+        settings=("demos", "replay", "filter"),
+        inputs=(INPUTS, MACHINE, PLAN, LEAKAGE),
+        outputs=(REPLAY, TRAJECTORIES_TABLE),
+        changed_file=_changed_replay,
     ),
     "render": Stage(
-        render,
-        ("demos", "replay", "filter", "render", "export"),
-        (INPUTS, MACHINE, PLAN, REPLAY),
-        (TRAJECTORIES_TABLE, FRAMES_TABLE),
-        _changed_frames,
+        work=render,
+        settings=("demos", "replay", "filter", "render", "export"),
+        inputs=(INPUTS, MACHINE, PLAN, REPLAY),
+        outputs=(TRAJECTORIES_TABLE, FRAMES_TABLE),
+        changed_file=_changed_frames,
     ),
     **{f"export_{group}": _export(group) for group in registry.GROUPS},
-    "manifest": Stage(write_manifest, _LABELLED, (INPUTS, *_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
-    "validate": Stage(validate, memory=finished.validate_memory, unchanged=date_validation),
-    "recipe": Stage(write_recipe, ("export", "finetune"), (MANIFEST, *_RECORDS), (FINETUNE,)),
-    "summary": Stage(summarize, memory=finished.summary_memory, unchanged=print_counts),
-    "card": Stage(write_card, inputs.PUBLISHED, (MANIFEST, *REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
-    "report": Stage(write_report, memory=finished.report_memory, unchanged=name_report),
+    "manifest": Stage(
+        work=write_manifest,
+        settings=_LABELLED,
+        inputs=(INPUTS, *_OUTCOME, *_RECORDS),
+        outputs=(MANIFEST, STATISTICS, COUNTS),
+    ),
+    "validate": Stage(work=validate, memory=finished.validate_memory, unchanged=date_validation),
+    "recipe": Stage(
+        work=write_recipe, settings=("export", "finetune"), inputs=(MANIFEST, *_RECORDS), outputs=(FINETUNE,)
+    ),
+    "summary": Stage(work=summarize, memory=finished.summary_memory, unchanged=print_counts),
+    "card": Stage(
+        work=write_card,
+        settings=inputs.PUBLISHED,
+        inputs=(MANIFEST, *REPORTS, *_RECORDS, FINETUNE, SHEETS),
+        outputs=(CARD,),
+    ),
+    "report": Stage(work=write_report, memory=finished.report_memory, unchanged=name_report),
 }
 """Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""
 

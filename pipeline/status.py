@@ -4,23 +4,35 @@ Nothing is changed.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from rich.table import Table
 
-from pipeline import stages
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.formats.registry import GROUPS
 from pipeline.generated import FOLDERS, edits, edits_in_words
-from pipeline.planning import plan, selection
+from pipeline.identity import describe_outdated
+from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
-from pipeline.run import cleaning, counts, dropped, export, finished, machine, outcome, plan_stage
-from pipeline.run.outcome import outdated
+from pipeline.run import cleaning, counts, dataset_basis, dataset_files, dropped, finished, machine, plan_stage
+from pipeline.run.outcome import RENDERINGS, REPLAYS, join_kinds, outdated
+from pipeline.run.progress import Progress
 from pipeline.run.run import Run
-from pipeline.run.verdicts import verdicts_of
-from pipeline.stores.frame_store import StoredFrames, frames_by_trajectory
-from pipeline.types import Verdict
+from pipeline.stages import STAGES, why_not
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
+
+EXPORTS = frozenset(f"export_{group}" for group in GROUPS)
+"""Stages that write the datasets."""
+
+EXPORTS_AND_LATER = tuple(STAGES)[list(STAGES).index("render") + 1 :]
+"""Stages after ``render``, in order."""
+
+NO_PLAN = "no plan exists yet; `doctor` checks the demonstrations and estimates the time"
+EPISODES_MISSING = "some of their episodes are missing"
+NEW_PLAN = "a new plan"
+DATASETS_CHANGE = "the datasets would change"
+"""Reasons that a stage has in common with all stages after it; a line states each for all of them."""
 
 
 def describe(run: Run) -> Iterator[str | Table]:
@@ -35,22 +47,18 @@ def describe(run: Run) -> Iterator[str | Table]:
     except PipelineError as error:
         yield f"the run cannot be planned: {error}"
         return
-    verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
-    frames = frames_by_trajectory(run.frames.rows())
-    views = config.render.content.views
-    rejected = outcome.rejections(rows, frames, views)
-    judged = selection.select(rows, verdicts, rejected)
+    progress = Progress.of(rows, run.trajectories.rows(), run.frames.rows(), config)
     if rows or config.plan.episodes:
-        yield _counts(config, rows, judged, frames)
-    steps = dict(_steps(run, rows, verdicts, frames, rejected))
-    if steps:
+        yield _counts(config, progress)
+    reasons = _reasons_to_run(run, progress)
+    if reasons:
         yield "stages that would run:"
-        yield from (f"  {step}: {why}" for step, why in steps.items())
+        yield from (f"  {line}" for line in _in_lines(reasons))
     # Until all episodes are replayed and rendered, undecided candidates count as kept, so nothing is short.
-    if not steps.keys() & {"all stages", "plan", "replay", "render"}:
-        missing = counts.shortfalls(_targets(config, rows, judged))
+    if not reasons.keys() & {"plan", "replay", "render"}:
+        missing = counts.shortfalls(_targets(config, progress))
         yield from missing
-        if not steps:
+        if not reasons:
             yield "no stage would run" if missing else "no stage would run: all datasets are finished"
     unneeded = dropped.measure(rows, run)
     if unneeded.asks:
@@ -61,157 +69,160 @@ def describe(run: Run) -> Iterator[str | Table]:
     yield from edits_in_words(run.folder)
     yield _disk(run)
     # Count undecided candidates as kept until they are replayed.
-    needed = _shown(config, rows, judged, rejected)
-    needed += [row for row in rows if judged[row.episode_id].reason == selection.NOT_REPLAYED]
-    yield from _time_left(run, needed, verdicts, frames, steps) if steps else ()
+    needed = [*_shown(progress), *progress.undecided()]
+    yield from _time_left(run, needed, progress, reasons.keys()) if reasons else ()
 
 
-def _shown(
-    config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str]
-) -> list[plan.Row]:
+def _shown(progress: Progress) -> list[plan.Row]:
     """List the episodes that have frames, or get frames in the stage ``render``."""
-    return [row for row in outcome.to_render(rows, judged, rejected, config.export) if row.episode_id not in rejected]
+    return [row for row in progress.to_render() if not progress.is_rejected(row)]
 
 
-def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict]) -> dict[str, counts.Target]:
+def _targets(config: Config, progress: Progress) -> dict[str, counts.Target]:
     """Count the episodes of the whole plan. Replays do not depend on ``export.where``."""
-    columns = [(row.axis, row.wanted, judged[row.episode_id].reason) for row in rows]
-    results = [{"axis": axis, "wanted": wanted, "reason": reason, "chosen": True} for axis, wanted, reason in columns]
+    results = []
+    for row in progress.rows:
+        reason = progress.verdict(row).reason
+        results.append({"axis": row.axis, "wanted": row.wanted, "reason": reason, "chosen": True})
     return counts.targets(results, config.plan.episodes)
 
 
-def _counts(
-    config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, StoredFrames]
-) -> Table:
+def _counts(config: Config, progress: Progress) -> Table:
+    rows = progress.rows
     table = Table("axis", title="episodes" if rows else "episodes, without the clean twins, which the plan adds")
     for head in ("wanted", "planned", "reach their goal", "rendered"):
         table.add_column(head, justify="right", no_wrap=True)
-    views, every = config.render.content.views, []
+    numbers = []
     axes = ["clean", *config.plan.episodes] if rows else config.plan.episodes
     for axis in axes:
         of_axis = [row for row in rows if row.axis == axis]
-        kept = [row for row in of_axis if judged[row.episode_id].kept]
+        kept = [row for row in of_axis if progress.verdict(row).kept]
         planned = sum(row.wanted for row in of_axis)
         wanted = config.plan.episodes.get(axis, planned)
-        rendered = sum(outcome.has_frames(row, frames, views) for row in kept)
-        every.append((wanted, planned, len(kept), rendered))
+        rendered = sum(progress.has_frames(row) for row in kept)
+        numbers.append((wanted, planned, len(kept), rendered))
         # The name of a combination may break after a +.
-        table.add_row(axis.replace("+", "+ "), *map(str, every[-1]))
+        table.add_row(axis.replace("+", "+ "), *map(str, numbers[-1]))
     table.add_section()
-    table.add_row("all", *map(str, map(sum, zip(*every, strict=True))))
+    table.add_row("all", *map(str, map(sum, zip(*numbers, strict=True))))
     return table
 
 
-def _steps(
-    run: Run,
-    rows: Sequence[plan.Row],
-    verdicts: Mapping[str, Verdict],
-    frames: Mapping[str, StoredFrames],
-    rejected: Mapping[str, str],
-) -> Iterator[tuple[str, str]]:
-    if not rows:
-        yield "all stages", "no plan exists yet; `doctor` checks the demonstrations and estimates the time"
-        return
-    config = run.config
-    why_planned = stages.why_not("plan", run)
+def _reasons_to_run(run: Run, progress: Progress) -> dict[str, str]:
+    """Map the stages that would run, in their order, to the reasons."""
+    if not progress.rows:
+        return dict.fromkeys(STAGES, NO_PLAN)
+    reasons: dict[str, str] = {}
+    why_planned = why_not("plan", run)
     if why_planned is not None:
-        yield "plan", why_planned
-    generated_again = outdated(rows, run.trajectories, run.frames)
-    needed = selection.pending(rows, verdicts, rejected)
-    if needed:
-        yield "replay", f"{len(needed)} trajectories are missing" + _of(generated_again, "trajectories")
-    judged = selection.select(rows, verdicts, rejected)
-    views = config.render.content.views
-    shown = _shown(config, rows, judged, rejected)
-    missing = [row for row in shown if not outcome.has_frames(row, frames, views)]
-    if missing:
-        yield "render", f"the frames of {len(missing)} episodes are missing" + _of(generated_again, "files of frames")
-    if needed or missing or why_planned is not None:
-        yield "exports and later stages", "some of their episodes are missing" if needed or missing else "a new plan"
-        return
-    yield from _follow(run)
+        reasons["plan"] = why_planned
+    generated_again = outdated(progress.rows, run.trajectories, run.frames)
+    not_replayed = progress.pending()
+    if not_replayed:
+        again = _generated_again(generated_again, REPLAYS)
+        reasons["replay"] = f"{len(not_replayed)} trajectories are missing{again}"
+    not_rendered = [row for row in _shown(progress) if not progress.has_frames(row)]
+    if not_rendered:
+        again = _generated_again(generated_again, RENDERINGS)
+        reasons["render"] = f"the frames of {len(not_rendered)} episodes are missing{again}"
+    if not_replayed or not_rendered:
+        return reasons | dict.fromkeys(EXPORTS_AND_LATER, EPISODES_MISSING)
+    if why_planned is not None:
+        return reasons | dict.fromkeys(EXPORTS_AND_LATER, NEW_PLAN)
+    return _other_reasons_to_run(run)
 
 
-def _follow(run: Run) -> Iterator[tuple[str, str]]:
-    """Yield the stages that would work although every wanted trajectory and frame is stored."""
-    yield from _outdated(run, ("doctor", "leakage"))
-    stale = list(_stale_datasets(run))
-    yield from stale
-    if stale:
-        yield "manifest and later stages", "the datasets would change"
-        return
-    yield from _outdated(run, ("manifest", "validate", "recipe", "summary", "card", "report"))
-
-
-def _outdated(run: Run, names: Sequence[str]) -> Iterator[tuple[str, str]]:
-    for name in names:
-        changed = stages.why_not(name, run)
-        if changed is None:
+def _other_reasons_to_run(run: Run) -> dict[str, str]:
+    """Map the stages that would run although the plan is up to date, and its trajectories and frames are stored."""
+    reasons: dict[str, str] = {}
+    stale = _stale_datasets(run)
+    for name in STAGES:
+        if name in ("inputs", "plan", "replay", "render"):
             continue
-        edited = any(edits(run.path(folder)) for folder in FOLDERS if folder in stages.STAGES[name].outputs)
-        yield name, "stops before it overwrites edits" if edited else changed
+        if name in EXPORTS:
+            reason = stale.get(name)
+        elif stale and name in EXPORTS_AND_LATER:
+            reason = DATASETS_CHANGE
+        else:
+            reason = _reason_to_run(name, run)
+        if reason is not None:
+            reasons[name] = reason
+    return reasons
 
 
-def _stale_datasets(run: Run) -> Iterator[tuple[str, str]]:
+def _reason_to_run(name: str, run: Run) -> str | None:
+    """Return the reason why a stage would run, or would stop because of edits; `None` if its outputs are up to date."""
+    reason = why_not(name, run)
+    if reason is None:
+        return None
+    edited = any(edits(run.path(folder)) for folder in FOLDERS if folder in STAGES[name].outputs)
+    return "stops before it overwrites edits" if edited else reason
+
+
+def _stale_datasets(run: Run) -> dict[str, str]:
+    """Map the stages ``export_<group>`` that would write a dataset again to the reasons."""
+    reasons: dict[str, str] = {}
     for dataset in (*run.formats, *(run.failure_formats if run.outcome.failures else ())):
-        episodes = export.episodes_of(dataset, run)
-        changed_file = export.changed_file(dataset)
+        episodes = dataset_basis.episodes_of(dataset, run)
+        changed_file = dataset_files.changed_file(dataset)
         if changed_file is not None:
-            why = finished.missing_or_changed(changed_file, run.folder)
-        elif not dataset.record().matches(export.compute_basis(dataset, episodes)):
-            reason = next(iter(export.outdated(dataset, episodes)), "files of other episodes or with other options")
-            why = f"the dataset has {reason}"
+            reason = finished.missing_or_changed(changed_file, run.folder)
+        elif not dataset.record().matches(dataset_basis.compute_basis(dataset, episodes)):
+            differences = dataset_basis.outdated(dataset, episodes)
+            reason = f"the dataset has {next(iter(differences), 'files of other episodes or with other options')}"
         else:
             continue
-        yield f"export_{dataset.group}", f"{dataset.title}: {why}"
+        reasons[f"export_{dataset.group}"] = f"{dataset.title}: {reason}"
+    return reasons
 
 
-def _of(generated_again: Counter[str], kind: str) -> str:
-    reasons = "; ".join(f"{number} {reason}" for reason, number in generated_again.items() if reason.startswith(kind))
-    return f" (would be generated again: {reasons})" if reasons else ""
+def _generated_again(outdated_files: Mapping[str, Counter[str]], kind: str) -> str:
+    """Describe the outdated files of a kind in brackets; empty without such files."""
+    files = join_kinds({kind: outdated_files.get(kind, Counter())})
+    return f" (would be generated again: {describe_outdated(files)})" if files else ""
 
 
-def _time_left(
-    run: Run,
-    needed: Sequence[plan.Row],
-    verdicts: Mapping[str, Verdict],
-    frames: Mapping[str, StoredFrames],
-    steps: Mapping[str, str],
-) -> Iterator[str]:
+def _in_lines(reasons: Mapping[str, str]) -> Iterator[str]:
+    """Yield a line for each stage; the stages that run because of earlier stages share the last line."""
+    for name, reason in reasons.items():
+        if reason not in (NO_PLAN, EPISODES_MISSING, NEW_PLAN, DATASETS_CHANGE):
+            yield f"{name}: {reason}"
+        elif reason == NO_PLAN:
+            yield f"all stages: {reason}"
+            return
+        else:
+            yield f"{'exports' if name in EXPORTS else name} and later stages: {reason}"
+            return
+
+
+def _time_left(run: Run, needed: Sequence[plan.Row], progress: Progress, to_run: Collection[str]) -> Iterator[str]:
     """Estimate the time left, from the speed that ``doctor`` measured, the needed rows and the stages to run."""
     speed = machine.known_speed(run)
     if speed is None or not needed:
         return
-    exports = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
-    validates = exports or any(step.startswith(("manifest", "validate")) for step in steps)
-    left = not_made(needed, verdicts, frames, run.config.render.content.views) | {
-        "export": float(exports),
-        "validate": float(validates),
-    }
+    exports = not EXPORTS.isdisjoint(to_run)
+    validates = exports or not {"manifest", "validate"}.isdisjoint(to_run)
+    left = not_made(progress, needed) | {"export": float(exports), "validate": float(validates)}
     left["GPU"] = left["render"]
     left_s = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(run.config, speed).items()}
     yield f"time left: {in_words(left_s, workers_of(run.config.compute))}"
 
 
-def not_made(
-    needed: Sequence[plan.Row],
-    verdicts: Mapping[str, Verdict],
-    frames: Mapping[str, StoredFrames],
-    views: tuple[str, ...],
-) -> dict[str, float]:
+def not_made(progress: Progress, needed: Sequence[plan.Row]) -> dict[str, float]:
     """Return the shares in [0, 1] of the trajectories and streams that ``replay`` and ``render`` have yet to generate.
 
-    Trajectories and streams that several rows share count once.
+    Trajectories and streams that several needed rows share count once.
     """
     trajectories = {row.trajectory_id for row in needed}
-    streams = set()
+    streams: set[tuple[str, str]] = set()
     for row in needed:
-        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations, views).values()}
-    rendered = set()
-    for trajectory, shown in frames.items():
-        rendered |= {(trajectory, stream) for stream in shown.streams}
+        streams_of_row = streams_of(row.perturbations, progress.views).values()
+        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of_row}
+    rendered: set[tuple[str, str]] = set()
+    for trajectory_id, stored in progress.frames.items():
+        rendered |= {(trajectory_id, stream_id) for stream_id in stored.streams}
     return {
-        "replay": len(trajectories - verdicts.keys()) / len(trajectories),
+        "replay": len(trajectories - progress.replay_verdicts.keys()) / len(trajectories),
         "render": len(streams - rendered) / len(streams),
     }
 

@@ -1,4 +1,4 @@
-"""Stages export_rlds and its likes, as DVC calls them; ``pipeline/stages.py`` has a stage for each group of formats."""
+"""Stages export_<group>, as DVC calls them; ``pipeline/stages.py`` has a stage for each group of formats."""
 
 from pipeline.stage_script import perform_stage
 

@@ -26,7 +26,7 @@ from pipeline.errors import PipelineError
 from pipeline.export_config import Where
 from pipeline.field_tables import with_tables
 from pipeline.libero.assets import libero_folder
-from pipeline.run.finished import settings_of
+from pipeline.run.inputs import settings_of
 
 STARTER = REPOSITORY / "configs" / "starter.yaml"
 

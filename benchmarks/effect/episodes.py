@@ -25,7 +25,7 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import leakage, plan, selection
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.layout import FRAMES, PLAN, TRAJECTORIES
-from pipeline.run.outcome import rejections
+from pipeline.run.progress import rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.run.verdicts import verdicts_of

@@ -30,7 +30,7 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 
 from pipeline.errors import PipelineError
 from pipeline.files import remove, replaced
-from pipeline.run.finished import host
+from pipeline.run.machine import host
 from pipeline.seeding import rng
 
 IMAGES = {view: f"observation.images.{view}" for view in VIEWS}

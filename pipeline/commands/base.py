@@ -99,8 +99,12 @@ class OneOf(click.ParamType[str]):
     def __init__(self, load_names: Callable[[], Iterable[str]]) -> None:
         self._load_names = load_names
 
+    def names(self) -> list[str]:
+        """List the names of the registry."""
+        return list(self._load_names())
+
     def convert(self, value: str, parameter: click.Parameter | None, context: click.Context | None) -> str:
-        names = list(self._load_names())
+        names = self.names()
         if value not in names:
             similar = get_close_matches(value, names, n=1)
             question = f" Did you mean {similar[0]}?" if similar else ""
@@ -110,7 +114,18 @@ class OneOf(click.ParamType[str]):
     def shell_complete(
         self, context: click.Context, parameter: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        return [CompletionItem(name) for name in self._load_names() if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in self.names() if name.startswith(incomplete)]
+
+
+class NamesOption(click.Option):
+    """Option of the type ``OneOf``, whose help ends with the names; they are loaded when the help is shown."""
+
+    def get_help_record(self, context: click.Context) -> tuple[str, str] | None:
+        record = super().get_help_record(context)
+        if record is None or not isinstance(self.type, OneOf):
+            return record
+        option, help_text = record
+        return option, f"{help_text} {', '.join(self.type.names())}."
 
 
 PROGRAM = "python -m pipeline"

@@ -214,6 +214,8 @@ def push(format_name: str, repository: str, config: Path, really: bool, private:
     the same run and format is rejected. A stopped upload resumes when the command is called again. The token is read
     from HF_TOKEN or `hf auth login`, and the address of another hub from HF_ENDPOINT.
     """
+    from pipeline.publish.push import compare, prepare, send
+
     run = open_run(config)
     if format_name not in run.config.export.formats:
         raise PipelineError(
@@ -221,13 +223,11 @@ def push(format_name: str, repository: str, config: Path, really: bool, private:
             where=f"export.{format_name}",
             expected=" or ".join(run.config.export.formats),
         )
-    from pipeline.publish import push
-
-    upload = push.prepare(run.dataset(format_name), run)
+    upload = prepare(run.dataset(format_name), run)
     print(upload.summary())
     options = {"private": private, "replace": replace}
     if really:
-        print(push.send(upload, repository, **options))
+        print(send(upload, repository, **options))
         return
-    print(push.compare(upload, repository, **options))
+    print(compare(upload, repository, **options))
     print(f"no file was uploaded: add --really to upload these files to {repository}")

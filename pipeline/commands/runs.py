@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.base import Command, OneOf, config_argument, example, open_run
+from pipeline.commands.base import Command, NamesOption, OneOf, config_argument, example, open_run
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
@@ -66,10 +66,10 @@ def status(config: Path) -> None:
     """
     from rich.console import Console
 
-    from pipeline import status
+    from pipeline.status import describe
 
     console = Console(soft_wrap=True, highlight=False)
-    for part in status.describe(open_run(config)):
+    for part in describe(open_run(config)):
         console.print(part)
 
 
@@ -83,11 +83,11 @@ def _parts() -> Iterable[str]:
 @config_argument
 @click.option(
     "--only",
+    cls=NamesOption,
     multiple=True,
     type=OneOf(_parts),
     metavar="PART",
-    help="Part to delete: unfinished, pictures, uploads, rlds, lerobot, hdf5, frames, trajectories or tables; may be "
-    "given several times (default: all parts).",
+    help="Part to delete; may be given several times (default: all parts). The parts are",
 )
 @click.option("--yes", is_flag=True, help="Delete without a question.")
 def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:

@@ -20,17 +20,14 @@ from packaging.requirements import Requirement
 
 from pipeline.compute.workers import VARIABLES
 from pipeline.errors import PipelineError
-from pipeline.files import checksum, schema_file
 from pipeline.formats.registry import FORMATS
-from pipeline.identity import DISTRIBUTION, PACKAGES
+from pipeline.identity import DISTRIBUTION, PACKAGES, digest_library
 from pipeline.machine_code import MACHINE_CODE_VARIABLES, in_shell, machine_code
-from pipeline.seeding import digest
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 PACKAGE = "pipeline"
-SOURCES = (".py", ".yaml", ".json", ".j2")
 
 
 @dataclass(frozen=True)
@@ -110,11 +107,7 @@ def setup() -> dict[str, str]:
             versions[name] = version(name)
         except PackageNotFoundError:
             versions[name] = "not installed"
-    package = Path(__file__).resolve().parent.parent
-    files = [file for file in package.rglob("*") if file.suffix in SOURCES]
-    files += schema_file("episode.json").parent.glob("*.json")
-    content = sorted((file.name, checksum(file)) for file in files)
-    return versions | {f"code of {PACKAGE}": digest("code", content)[:16]}
+    return versions | {f"code of {PACKAGE}": digest_library()[:16]}
 
 
 def _requirements() -> list[str]:

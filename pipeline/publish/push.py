@@ -37,7 +37,7 @@ from pipeline.publish.repository import (
     read,
 )
 from pipeline.record import Basis
-from pipeline.run.export import OFT_STATISTICS
+from pipeline.run.dataset_files import OFT_STATISTICS
 from pipeline.run.inputs import published_settings
 from pipeline.run.layout import CARD, FINETUNE
 from pipeline.run.run import Run

@@ -216,20 +216,20 @@ def _reject_other_owner(config: Config, file: Path) -> None:
     if mark is None or mark.file == file.resolve():
         return
     this, owner = _shown(file.resolve(), mark.file)
-    adopt = f'to assign the folder to {this}, write {{"configuration": "{this}"}} into {folder / OWNER}'
     if mark.file.exists():
         raise PipelineError(
             f"the folder belongs to {owner}, and {this} has the same name: {config.name}",
             where=folder,
             expected="a separate folder for each configuration file, as a run deletes files that it did not plan",
-            remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
+            remedy=f"change `name:` in {this}, or `folder:`",
         )
     if mark.content != _content(file):
         raise PipelineError(
             f"the folder belongs to {owner}, which is missing, and {this} has different content",
             where=folder,
             expected="the configuration of the last run, after a move of the folder or of the configuration file",
-            remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
+            remedy=f"change `name:` in {this}, or `folder:`; to assign the folder to {this}, write "
+            f'{{"configuration": "{this}"}} into {folder / OWNER}',
         )
 
 

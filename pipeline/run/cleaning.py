@@ -9,7 +9,7 @@ from pipeline.files import keep_below, remove, remove_if_empty
 from pipeline.formats.registry import GROUPS, formats_in
 from pipeline.generated import reject_edits
 from pipeline.run.claim import locked, reject_unmarked
-from pipeline.run.export import put_away_records, reject_unrecorded
+from pipeline.run.dataset_files import list_put_away_records, reject_deleting_foreign
 from pipeline.run.foreign import reject_foreign_files
 from pipeline.run.layout import (
     CARD,
@@ -106,7 +106,7 @@ def reject_foreign(run: Run, parts: Iterable[str]) -> None:
         reject_foreign_files(run.folder, PARTS[part].names)
         if part in GROUPS:
             for folder in filter(Path.is_dir, map(run.path, PARTS[part].names)):
-                reject_unrecorded(folder)
+                reject_deleting_foreign(folder)
 
 
 def delete(run: Run, parts: Iterable[str]) -> None:
@@ -126,7 +126,7 @@ def delete(run: Run, parts: Iterable[str]) -> None:
         for part in sorted(chosen, key=lambda part: part == UNFINISHED):
             for path in map(run.path, PARTS[part].names):
                 if part == UNFINISHED:
-                    keep_below(path, put_away_records(path))
+                    keep_below(path, list_put_away_records(path))
                     remove_if_empty(path)
                 else:
                     remove(path)

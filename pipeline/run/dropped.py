@@ -4,22 +4,20 @@ The stages ``plan``, ``replay`` and ``render`` call ``reject_deletion`` before t
 ``status`` and ``doctor`` report the result of ``measure``.
 """
 
-import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipeline.errors import PipelineError
-from pipeline.identity import ALLOW, REMAKE
+from pipeline.identity import ALLOW, remake_allowed
 from pipeline.planning import plan
-from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
+from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED
 from pipeline.planning.streams import streams_of
 from pipeline.run import machine
-from pipeline.run.outcome import has_frames, rejections, to_render
+from pipeline.run.progress import Progress
 from pipeline.run.run import Run
-from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
-from pipeline.stores.frame_store import frames_by_trajectory, settings_of
+from pipeline.stores.frame_store import settings_of
 from pipeline.types import Verdict
 
 LARGEST_SHARE = 0.1
@@ -111,7 +109,7 @@ def reject_deletion(rows: Sequence[plan.Row], run: Run) -> None:
         PipelineError: when the share is above ``LARGEST_SHARE`` and ``REMAKE=1`` is not set. Nothing was changed.
     """
     dropped = measure(rows, run)
-    if dropped.asks and os.environ.get(REMAKE) != "1":
+    if dropped.asks and not remake_allowed():
         raise PipelineError(
             f"the run would delete finished work that the configuration no longer needs: {dropped}",
             where=run.folder,
@@ -125,20 +123,21 @@ def reject_deletion(rows: Sequence[plan.Row], run: Run) -> None:
 
 def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str, str]]]:
     """Return the ids of the trajectories that a plan may need, and pairs of trajectory id and id of a needed stream."""
-    config = run.config
-    verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
-    frames, views = frames_by_trajectory(run.frames.rows()), config.render.content.views
-    rejected = rejections(rows, frames, views)
-    undecided = Verdict(False, NOT_REPLAYED)
-    # A reserve is needed unless the candidates before it are replayed, rendered and kept.
-    verdict_of = {row.trajectory_id: verdicts.get(row.trajectory_id, undecided) for row in rows}
-    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not has_frames(row, frames, views)}
-    judged = select(rows, verdict_of, not_rendered | rejected)
-    trajectories = {row.trajectory_id for row in rows if judged[row.episode_id].reason != NOT_NEEDED}
+    progress = Progress.of(rows, run.trajectories.rows(), run.frames.rows(), run.config)
+    # A reserve is needed unless the candidates before it are replayed, rendered and kept. Rows without a replay or
+    # without frames therefore count as dropped, with the reason of undecided rows.
+    not_replayed = {row.trajectory_id: Verdict(False, NOT_REPLAYED) for row in rows}
+    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not progress.has_frames(row)}
+    cautious = replace(
+        progress,
+        replay_verdicts={**not_replayed, **progress.replay_verdicts},
+        rejected={**not_rendered, **progress.rejected},
+    )
+    trajectories = {row.trajectory_id for row in rows if cautious.verdict(row).reason != NOT_NEEDED}
     streams: set[tuple[str, str]] = set()
-    undecided_rows = [row for row in rows if judged[row.episode_id].reason == NOT_REPLAYED]
-    for row in (*to_render(rows, judged, rejected, config.export), *undecided_rows):
-        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations, views).values()}
+    for row in (*cautious.to_render(), *cautious.undecided()):
+        streams_of_row = streams_of(row.perturbations, progress.views).values()
+        streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of_row}
     return trajectories, streams
 
 

@@ -7,7 +7,6 @@ files and datasets mark them as expanded.
 
 from __future__ import annotations
 
-import os
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +27,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import remove
 from pipeline.grouping import grouped
-from pipeline.identity import DISTRIBUTION, REMAKE, reject_unasked
+from pipeline.identity import DISTRIBUTION, REMAKE, reject_unasked, remake_allowed
 from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
@@ -145,7 +144,7 @@ def _reject_loss(file: Path, rows: Sequence[plan.Row]) -> None:
     lost = {*hdf5.expansions(file)} - {hdf5.Expanded(row.perturbations, _reset_seed(row)) for row in rows}
     if not lost:
         return
-    if os.environ.get(REMAKE) == "1":
+    if remake_allowed():
         print(f"replaced {len(lost)} demonstrations in {file}")
         return
     raise PipelineError(

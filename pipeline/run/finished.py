@@ -1,29 +1,23 @@
 """Memory of stages with few outputs: skip a stage if its inputs and recipe have not changed since its last call.
 
-The memory is a file of ``data/<run>/.finished/``. To have a stage work again, delete its output, and a
-dataset together with its record.
+The memory of a stage is the file ``data/<run>/.finished/<stage>.json``. A stage works again if one of its outputs is
+deleted; for a dataset, delete its record, too.
 """
 
-import json
-import platform
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 from itertools import chain
-from pathlib import Path, PurePath
-from typing import Any
-
-from pydantic import BaseModel
+from pathlib import Path
 
 from pipeline.axes.language import BANK_FILE
 from pipeline.config import Config
-from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
 from pipeline.formats.registry import FORMATS
-from pipeline.identity import RECIPES, Step, made_with, versions
+from pipeline.identity import LIBRARY, RECIPES, Step, digest_library, made_with, versions
 from pipeline.record import Basis, Record
-from pipeline.run.export import changed_file
+from pipeline.run.dataset_files import changed_file
+from pipeline.run.inputs import settings_of
 from pipeline.run.layout import (
     COUNTS,
     FINISHED,
@@ -40,12 +34,11 @@ from pipeline.run.layout import (
     TRAJECTORIES,
     VALIDATION,
 )
+from pipeline.run.machine import host
 from pipeline.run.run import Run
-from pipeline.seeding import digest
 from pipeline.stores.store import TABLE
 
 TRAJECTORIES_TABLE, FRAMES_TABLE = f"{TRAJECTORIES}/{TABLE}", f"{FRAMES}/{TABLE}"
-LIBRARY = Path(__file__).parents[1]
 SEEN = LIBRARY / "testset" / "seen.json"
 """File of measures of the test tasks, which the report shows next to the measures of the run."""
 
@@ -132,18 +125,10 @@ def stage_memory(
     except PipelineError:
         # The stage `doctor` reports the fault.
         return Memory(run.folder, name, None, outputs, "a package is missing, or another copy of it is imported")
-    made_with_all["code"] = library()[:16]
+    made_with_all["code"] = digest_library()[:16]
     contents = _contents([run.path(file) for file in inputs], run.folder)
     basis = Basis.of({"settings": dict(settings), "files": contents}, made_with_all)
     return Memory(run.folder, name, basis, outputs)
-
-
-@cache
-def library() -> str:
-    """Return a digest of every file of this package, and of the schema of an episode."""
-    files = [file for file in sorted(LIBRARY.rglob("*")) if file.is_file() and "__pycache__" not in file.parts]
-    content = {file.relative_to(LIBRARY).as_posix(): checksum(file) for file in files}
-    return digest(content, SCHEMA.model_dump(mode="json"))
 
 
 def validate_memory(run: Run) -> Memory:
@@ -169,14 +154,6 @@ def trial_memory(run: Run, device: str) -> Memory:
     """Return the memory of a trial of this machine."""
     basis = Basis.of({"host": host()}, {**made_with("pixels"), "OpenGL device": device})
     return Memory(run.folder, "trial", basis, [MACHINE])
-
-
-def host() -> list[list[str]]:
-    """Return this machine's name and kernel, and the models of its processors."""
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text().splitlines() if cpu.exists() else []
-    models = {line for line in lines if line.startswith("model name")}
-    return [list(platform.uname()), sorted(models)]
 
 
 def summary_memory(run: Run) -> Memory:
@@ -241,20 +218,6 @@ def _contents(paths: Sequence[Path], data: Path) -> Mapping[str, str]:
             if file.exists():
                 contents[file.relative_to(data).as_posix()] = checksum(file)
     return contents
-
-
-def settings_of(section: BaseModel, but: Set[str] = frozenset()) -> dict[str, Any]:
-    """Return the fields of a section, JSON-serialisable.
-
-    Paths are reduced to their last name, as ``inputs.json`` lists the content of the files.
-
-    Args:
-        but: fields to leave out.
-    """
-    # Aliases are the field names of the first version that wrote them.
-    dumped = section.model_dump(exclude=set(but), by_alias=True)
-    listed: dict[str, Any] = json.loads(json.dumps(dumped, default=lambda path: PurePath(path).name))
-    return listed
 
 
 def _files(path: Path) -> list[Path]:

@@ -5,9 +5,10 @@ writes out the configuration and lists these files each time, and other stages d
 noticed; if nothing has changed, nothing runs again.
 """
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Iterator, Mapping, Set
 from glob import glob
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 from pydantic import BaseModel
@@ -16,7 +17,7 @@ from pipeline.config import Config
 from pipeline.export_config import ExportConfig
 from pipeline.files import checksum
 from pipeline.libero.tasks import OWN, SUITES, select_tasks, tasks
-from pipeline.run.finished import host, settings_of
+from pipeline.run.machine import host
 
 HASHED_BYTES = 16_000_000
 """Largest size of a file that is listed by its content; larger files are listed by size and time of change."""
@@ -64,6 +65,20 @@ def published_settings(config: Config) -> dict[str, Any]:
     """Return the sections of ``PUBLISHED`` with all fields, which a card records."""
     sections = settings(config)
     return {name: sections[name] for name in PUBLISHED}
+
+
+def settings_of(section: BaseModel, but: Set[str] = frozenset()) -> dict[str, Any]:
+    """Return the fields of a section, JSON-serialisable.
+
+    Paths are reduced to their last name, as ``listing`` lists their files.
+
+    Args:
+        but: fields to leave out.
+    """
+    # Aliases are the field names of the first version that wrote them.
+    dumped = section.model_dump(exclude=set(but), by_alias=True)
+    listed: dict[str, Any] = json.loads(json.dumps(dumped, default=lambda path: PurePath(path).name))
+    return listed
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:

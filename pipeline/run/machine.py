@@ -5,11 +5,13 @@ recipes, versions and device. A run that has files resumes only if the same vers
 """
 
 import hashlib
+import platform
 import time
 import timeit
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 from pipeline import gl
@@ -97,6 +99,14 @@ def _seconds(call: Callable[[], object], gpu: bool = False) -> float:
     """
     timer = time.perf_counter if gpu else time.process_time
     return min(timeit.repeat(call, number=1, repeat=10, timer=timer))
+
+
+def host() -> list[list[str]]:
+    """Return this machine's name and kernel, and the models of its processors."""
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text().splitlines() if cpu.exists() else []
+    models = {line for line in lines if line.startswith("model name")}
+    return [list(platform.uname()), sorted(models)]
 
 
 def keep_speed(run: Run, speed: Speed) -> None:

@@ -20,7 +20,7 @@ from pipeline.identity import DISTRIBUTION, VERSIONS, version_column, versions
 from pipeline.libero.tasks import exceeds_step_limit
 from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED
-from pipeline.run.outcome import Outcome, has_frames
+from pipeline.run.outcome import Outcome, is_selected
 from pipeline.tables import column, columns_of, read_table, write_table
 from pipeline.types import Frozen, Quality
 
@@ -38,7 +38,7 @@ class Result:
     reason: Annotated[
         str,
         "kept, or the reason for dropping; of the replay: goal_not_reached, goal_lost, too_short, simulation_unstable, "
-        "scene_refused, state_mismatch, worker_lost, no_reference, not_replayed, the reason of a rejected physics "
+        "scene_refused, state_mismatch, worker_lost, no_reference, the reason of a rejected physics "
         "perturbation, or the column beyond a limit of `filter`; of the frames: too_dark, blown_out, "
         "task_object_not_seen, hand_not_seen, added_objects_not_seen, camera_missing, worker_lost; of the selection: "
         "reserve_not_needed, left_out (by export.where)",
@@ -103,7 +103,7 @@ class Settings(Frozen):
 
 
 def build(
-    run: Outcome,
+    outcome: Outcome,
     places: Mapping[str, Mapping[str, Any]],
     columns: Sequence[pa.Field],
     where: Where | None,
@@ -112,7 +112,7 @@ def build(
     """Join the plan with the results of its episodes.
 
     Args:
-        run: plan, verdicts and stored files of a run.
+        outcome: plan, verdicts and stored files of a run.
         places: id of every kept episode to its place in the datasets.
         columns: columns of ``places``.
         where: ``export.where``.
@@ -120,20 +120,20 @@ def build(
     """
     version_of_column = {version_column(name): version for name, version in versions().items()}
     table = []
-    for row in run.rows:
-        verdict = run.verdicts[row.episode_id]
+    for row in outcome.rows:
+        verdict = outcome.verdicts[row.episode_id]
         # The trajectory of a reserve that was not needed may be stored for another episode.
-        replayed = run.trajectories.get(row.trajectory_id, {}) if verdict.reason != NOT_NEEDED else {}
-        frames = run.frames[row.trajectory_id] if replayed and has_frames(row, run.frames, run.views) else None
+        replayed = outcome.trajectories.get(row.trajectory_id, {}) if verdict.reason != NOT_NEEDED else {}
+        frames = outcome.frames[row.trajectory_id] if replayed and outcome.has_frames(row) else None
         result = Result(
             kept=verdict.kept,
             reason=verdict.reason,
-            chosen=where is None or where.takes(row.axis, row.component, row.level, row.suite),
+            chosen=is_selected(row, where),
             replay_mode=replayed.get("mode"),
             steps=replayed.get("steps"),
             exceeds_step_limit=exceeds_step_limit(row.suite, replayed["steps"]) if replayed else None,
             resolved=replayed.get("resolved"),
-            path_ratio=_ratio(replayed, run.trajectories.get(run.row_of[row.twin_id].trajectory_id, {})),
+            path_ratio=_ratio(replayed, outcome.trajectories.get(outcome.row_of[row.twin_id].trajectory_id, {})),
             gl_device=frames.device if frames else None,
             actions_sha256=frames.actions_sha256 if frames else None,
             subtask_starts=[subtask.step for subtask in frames.subtasks] if frames else None,

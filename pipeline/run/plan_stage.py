@@ -4,11 +4,11 @@ import sys
 from collections.abc import Sequence
 
 from pipeline.config import Config
-from pipeline.identity import made_with
+from pipeline.identity import digest_library, made_with
 from pipeline.planning import plan
 from pipeline.record import Basis
 from pipeline.run import inputs
-from pipeline.run.finished import Memory, library
+from pipeline.run.finished import Memory
 from pipeline.run.layout import PLAN
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE
@@ -58,5 +58,5 @@ def memory(run: Run) -> Memory:
     settings = inputs.settings(config)
     sections = {name: settings[name] for name in ("demos", "plan", "replay")}
     requested = {"settings": sections, "files": inputs.listing(config)}
-    basis = Basis.of(requested, {**made_with("physics"), "code": library()[:16]})
+    basis = Basis.of(requested, {**made_with("physics"), "code": digest_library()[:16]})
     return Memory(run.folder, "plan", basis, [PLAN])

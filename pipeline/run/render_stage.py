@@ -11,11 +11,9 @@ from pipeline.compute.pool import Expendable, Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row
-from pipeline.planning.selection import select
 from pipeline.planning.streams import Stream, streams_of
-from pipeline.run.outcome import rejections, to_render
+from pipeline.run.progress import Progress, rejections
 from pipeline.run.replay_stage import Replays
-from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, file_name, frames_by_trajectory
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
@@ -95,12 +93,11 @@ def render_plan(
         PipelineError: when rendering leaves the same work undone.
     """
     device = gl.choose().device
-    judged = verdicts_of(trajectories.rows(), rows, config.filter)
-    views = config.render.content.views
+    replays = trajectories.rows()
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in frames.refresh().items() if row["device"] == device}
-        needed = _needed(rows, judged, rejections(rows, frames_by_trajectory(stored), views), config)
+        needed = _needed(Progress.of(rows, replays, stored, config))
         missing = {name: portion for name, portion in needed.items() if name not in stored}
         if not missing:
             return set(needed)
@@ -129,27 +126,16 @@ def render_plan(
             scene_of_process().close()
 
 
-def _needed(
-    rows: Sequence[Row],
-    judged: Mapping[str, Verdict],
-    rejected: Mapping[str, str],
-    config: Config,
-) -> dict[str, Portion]:
-    """Map the name of each file that the plan needs to its portion, by the verdicts and rejections so far.
-
-    Args:
-        judged: trajectory id to its verdict.
-        rejected: episode id to the reason why its frames were rejected.
-        config: configuration of the run.
-    """
+def _needed(progress: Progress) -> dict[str, Portion]:
+    """Map the name of each file that the plan needs to its portion, by the verdicts and rejections so far."""
     # Episodes of a trajectory share its replay and its files, so any of their rows names its demonstration and task.
-    row_of = {row.trajectory_id: row for row in rows}
+    row_of = {row.trajectory_id: row for row in progress.rows}
     planned: dict[str, dict[str, Stream]] = {trajectory_id: {} for trajectory_id in row_of}
-    for row in rows:
-        planned[row.trajectory_id] |= _streams(row, config)
+    for row in progress.rows:
+        planned[row.trajectory_id] |= _streams(row, progress.views)
     needed: dict[str, set[str]] = {}
-    for row in to_render(rows, select(rows, judged, rejected), rejected, config.export):
-        needed.setdefault(row.trajectory_id, set()).update(_streams(row, config))
+    for row in progress.to_render():
+        needed.setdefault(row.trajectory_id, set()).update(_streams(row, progress.views))
     files: dict[str, Portion] = {}
     for trajectory_id, stream_ids in needed.items():
         for portion in portions(planned[trajectory_id], stream_ids):
@@ -158,6 +144,6 @@ def _needed(
     return files
 
 
-def _streams(row: Row, config: Config) -> dict[str, Stream]:
+def _streams(row: Row, views: tuple[str, ...]) -> dict[str, Stream]:
     """Map the ids of an episode's streams to the streams."""
-    return {stream.stream_id: stream for stream in streams_of(row.perturbations, config.render.content.views).values()}
+    return {stream.stream_id: stream for stream in streams_of(row.perturbations, views).values()}

@@ -8,6 +8,12 @@ from pipeline.libero.tasks import exceeds_step_limit
 from pipeline.planning.plan import Row
 from pipeline.types import Verdict
 
+FAILURE_REASONS = ("goal_not_reached", "goal_lost")
+"""Reasons of failures: replays that were simulated to the end and missed their goal.
+
+Good demonstrations fail too: see the yields in docs/axes.md.
+"""
+
 
 def verdicts_of(
     stored: Mapping[str, Mapping[str, Any]], rows: Sequence[Row], limits: FilterConfig

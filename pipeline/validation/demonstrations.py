@@ -20,8 +20,8 @@ from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.libero.tasks import IN_SCENE, STEP_LIMITS, exceeds_step_limit, find_task, suites
 from pipeline.physics.environment import environment_of
 from pipeline.planning.plan import twins
-from pipeline.run.outcome import FAILURE_REASONS
 from pipeline.run.replay_job import ReplayJob
+from pipeline.run.verdicts import FAILURE_REASONS
 from pipeline.testset.own_tasks import reject_test_tasks
 from pipeline.types import Task
 

@@ -27,14 +27,14 @@ from pipeline.compute_config import USUAL_GB, ComputeConfig
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.registry import FORMATS
-from pipeline.identity import DISTRIBUTION
+from pipeline.identity import DISTRIBUTION, describe_outdated
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.origins import REINSTALL
 from pipeline.run import dropped, machine, plan_stage
 from pipeline.run.claim import find_missing_parent
 from pipeline.run.cleaning import size_mb
-from pipeline.run.outcome import outdated
+from pipeline.run.outcome import join_kinds, outdated
 from pipeline.run.run import Run
 from pipeline.testset import benchmark
 from pipeline.validation.needs import RUN_MB, free_gb, in_words, needed_mb, needed_s, workers_of
@@ -155,15 +155,15 @@ def _finished(run: Run) -> Diagnosis:
         return Diagnosis("finished work", "warn", f"unknown, because the run cannot be planned: {error.what}")
     try:
         unneeded = dropped.measure(rows, run)
-        reasons = outdated(rows, run.trajectories, run.frames, gl.choose().device)
+        outdated_files = outdated(rows, run.trajectories, run.frames, gl.choose().device)
     except PipelineError as error:
         return Diagnosis("finished work", "fail", f"{error.where}: {error.what}", error.remedy or "")
     if unneeded.asks:
         remedy = "restore the configuration, give it another `name:`, or put `REMAKE=1` before the command"
         return Diagnosis("finished work", "warn", f"no longer needed, and would be deleted: {unneeded}", remedy)
-    if not reasons:
+    if not outdated_files:
         return Diagnosis("finished work", "ok", "is kept, or does not exist yet")
-    listed = "; ".join(f"{number} {reason}" for reason, number in reasons.items())
+    listed = describe_outdated(join_kinds(outdated_files))
     remedy = "resume on the machine that generated it, or put `REMAKE=1` before the command"
     return Diagnosis("finished work", "warn", f"outdated: {listed}", remedy)
 

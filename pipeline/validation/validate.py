@@ -32,6 +32,7 @@ from pipeline.run import outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.layout import COUNTS, STATISTICS, WORK
+from pipeline.run.progress import has_frames
 from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
 from pipeline.stores.frame_store import frames_by_trajectory
@@ -182,7 +183,7 @@ def _unlike_plan(run: Run) -> Iterator[Fault]:
     """Compare the plan's columns of the manifest with the plan, and ``chosen`` with ``export.where``."""
     where = run.config.export.where
     for planned, row in _planned_rows(run):
-        chosen = where is None or where.takes(planned.axis, planned.component, planned.level, planned.suite)
+        chosen = outcome.is_selected(planned, where)
         yield from _unlike_row(row, {**asdict(planned), "chosen": chosen})
 
 
@@ -202,7 +203,7 @@ def _unlike_stores(run: Run) -> Iterator[Fault]:
         needed = row["reason"] != selection.NOT_NEEDED
         replayed = trajectories.get(planned.trajectory_id, {}) if needed else {}
         twin = trajectories.get(trajectory_of[planned.twin_id], {})
-        rendered = bool(replayed) and outcome.has_frames(planned, frames, run.config.render.content.views)
+        rendered = bool(replayed) and has_frames(planned, frames, run.config.render.content.views)
         path_m, twin_path_m = replayed.get("path_m"), twin.get("path_m")
         expected = {
             "steps": replayed.get("steps"),

@@ -14,7 +14,7 @@ from pipeline.formats.base import AnyFormat
 from pipeline.formats.read_back import Written
 from pipeline.planning import plan
 from pipeline.run import manifest
-from pipeline.run.export import unrecorded_files
+from pipeline.run.dataset_files import foreign_files
 from pipeline.run.layout import COUNTS, DATASETS, LEAKAGE, STATISTICS
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE, Store
@@ -85,13 +85,13 @@ def _verify_dataset(dataset: AnyFormat, record_sha256: str | None, workers: Work
     """
     try:
         files = dataset.written()
-        unrecorded = unrecorded_files(dataset)
+        foreign = foreign_files(dataset)
     except PipelineError as error:
         return {"checked": 0, "damaged": [str(error)]}
     damages = []
     for faults in workers(Written.faults, files, dataset.title):
         damages.append([f"{fault.what}: {fault.expected}" for fault in faults])
-    damages.append([f"{file}: no record of an export lists it; move it to another place" for file in unrecorded])
+    damages.append([f"{file}: no record of an export lists it; move it to another place" for file in foreign])
     if record_sha256 is not None and checksum(dataset.record_file) != record_sha256:
         remedy = f"restore it, or move it and {dataset.folder} to another place"
         damages.append([f"{dataset.record_file}: not the record that the export wrote; {remedy}"])

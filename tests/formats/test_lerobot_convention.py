@@ -14,7 +14,8 @@ from synthetic import IDS, NAME, episode, episodes, loop
 from pipeline.config import load
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig
 from pipeline.run import manifest
-from pipeline.run.export import episodes_of, export
+from pipeline.run.dataset_basis import episodes_of
+from pipeline.run.export import export
 from pipeline.run.run import Run
 from pipeline.validation.validate import EpisodesJob
 

@@ -163,6 +163,15 @@ def test_a_file_may_be_named_by_its_absolute_path_and_from_elsewhere(
     claim_folder(file)
 
 
+def test_a_folder_is_not_to_be_assigned_to_a_copy_while_its_configuration_exists(clone: Path) -> None:
+    """Each run would delete finished work of the other one."""
+    claim_folder(Path("configs/tiny.yaml"))
+    shutil.copy("configs/tiny.yaml", "configs/copy.yaml")
+    with pytest.raises(PipelineError, match=r"belongs to configs/tiny\.yaml") as caught:
+        claim_folder(Path("configs/copy.yaml"))
+    assert caught.value.remedy == "change `name:` in configs/copy.yaml, or `folder:`"
+
+
 def test_marks_of_earlier_versions_count(clone: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     file, mark = Path("configs/tiny.yaml"), clone / "data" / "tiny" / OWNER
     claim_folder(file)

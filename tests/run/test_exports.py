@@ -19,7 +19,8 @@ from pipeline.formats.base import DatasetRecord, Format
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.record import Basis
-from pipeline.run.export import export, is_up_to_date, remove_leftovers
+from pipeline.run.dataset_basis import is_up_to_date
+from pipeline.run.export import export, remove_unneeded_files
 from pipeline.types import Episode
 
 PIECES = 3
@@ -148,7 +149,7 @@ def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_p
     (first.parent / "dataset_statistics_0123.json").write_text("{}")
     (made.work / "foreign").mkdir(parents=True)
     assert is_up_to_date(made, source)
-    remove_leftovers(made)
+    remove_unneeded_files(made)
     assert stamps(made.folder) == before
     assert not (tmp_path / ".work").exists()
 

@@ -11,7 +11,8 @@ from synthetic import episodes, write_rlds
 from pipeline import identity, stages
 from pipeline.config import Config, load
 from pipeline.formats.rlds import Rlds
-from pipeline.run import export
+from pipeline.run import dataset_basis, export
+from pipeline.run.dataset_files import is_unchanged
 from pipeline.run.finished import Memory, previews_memory, report_memory, summary_memory, validate_memory
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE
@@ -125,7 +126,7 @@ def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Confi
         # As in a copy that has the time of the copying.
         (one.folder / name).write_bytes(content[name])
         export.notice_changes(one)
-        assert export.untouched(one)
+        assert is_unchanged(one)
         (one.folder / name).write_bytes(content[name][:-1])
         export.notice_changes(one)
         assert not one.record_file.exists()
@@ -135,13 +136,14 @@ def test_a_finished_dataset_is_generated_again_only_where_that_was_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target, same = write_rlds(tmp_path), episodes()
-    assert not export.outdated(target, same)
+    assert not dataset_basis.outdated(target, same)
     number = Rlds.recipe + 1
     monkeypatch.setattr(Rlds, "recipe", number)
-    assert not export.is_up_to_date(target, same)
+    assert not dataset_basis.is_up_to_date(target, same)
     files = len(target.record().files)
-    assert export.outdated(target, same) == {f"files, generated with recipe of rlds {number - 1}, here {number}": files}
-    assert not export.outdated(target, episodes(content="other episodes")), "which somebody asked for"
+    reason = f"files, generated with recipe of rlds {number - 1}, here {number}"
+    assert dataset_basis.outdated(target, same) == {reason: files}
+    assert not dataset_basis.outdated(target, episodes(content="other episodes")), "which somebody asked for"
 
 
 def test_a_lost_shard_is_made_again_and_a_damaged_trajectory_once_it_is_moved_away(clone: Path, config: Config) -> None:

@@ -17,7 +17,8 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
-from pipeline.run.outcome import Outcome, list_failures, to_render
+from pipeline.run.outcome import Outcome, list_failures
+from pipeline.run.progress import Progress
 from pipeline.stores.frame_store import StoredFrames
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Subtask, Verdict
@@ -84,16 +85,17 @@ def test_an_episode_without_the_frames_of_a_further_view_is_not_rendered(run: Ou
 
 
 def test_kept_and_requested_failures_and_rejected_episodes_are_rendered(run: Outcome) -> None:
-    reasons = ("kept", "goal_not_reached", "reserve_not_needed", "too_dark", "worker_lost")
-    judged = {row.episode_id: Verdict(False, reason) for row, reason in zip(run.rows, reasons, strict=True)}
-    twin, failure, _, rejected, _ = run.rows
-    judged[twin.episode_id] = Verdict(True, "kept")
+    twin, rejected, reserve, failure, undecided = run.rows
+    verdicts = {twin.trajectory_id: Verdict(True, "kept"), failure.trajectory_id: Verdict(False, "goal_not_reached")}
 
-    def rendered(**export: Any) -> list[plan.Row]:
-        return to_render(run.rows, judged, {rejected.episode_id: "too_dark"}, ExportConfig(**export))
+    def progress(**export: Any) -> Progress:
+        reasons = {rejected.episode_id: "too_dark"}
+        return Progress(run.rows, verdicts, run.frames, reasons, run.views, ExportConfig(**export))
 
-    assert rendered() == [twin, rejected]
-    assert rendered(failures=True, where=Where(axis=("robot",))) == [twin, failure, rejected]
+    assert progress().to_render() == [twin, rejected, reserve]
+    assert progress(failures=True, where=Where(axis=("robot",))).to_render() == [twin, rejected, reserve, failure]
+    assert progress().undecided() == [undecided]
+    assert progress().pending() == [undecided.trajectory_id]
 
 
 def test_only_what_the_export_names_counts_as_chosen(run: Outcome) -> None:

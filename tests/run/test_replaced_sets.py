@@ -25,7 +25,8 @@ from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobot
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run import cleaning
 from pipeline.run.claim import OWNER
-from pipeline.run.export import _bring_up_to_date, notice_changes, reject_unrecorded
+from pipeline.run.dataset_files import reject_deleting_foreign
+from pipeline.run.export import _bring_up_to_date, notice_changes
 from pipeline.run.run import Run
 from pipeline.types import Episode
 
@@ -256,7 +257,7 @@ def test_a_file_with_the_name_of_a_file_to_write_stays(
             command("rlds", folder)
         assert str(caught.value.remedy).startswith("move it to another place, and run the command again; or let ")
     with pytest.raises(PipelineError, match="no record of an export lists the file, and it would be deleted"):
-        reject_unrecorded(folder / "rlds")
+        reject_deleting_foreign(folder / "rlds")
     assert (folder / name).read_text() == "of the user"
     monkeypatch.setenv("REMAKE", "1")
     command("rlds", folder)

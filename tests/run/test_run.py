@@ -35,8 +35,8 @@ from pipeline.physics.subtasks import subtasks
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
+from pipeline.run.dataset_basis import episodes_of
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.export import episodes_of
 from pipeline.run.layout import DATASETS, FINISHED, STATISTICS
 from pipeline.run.run import Run
 from pipeline.stores.trajectory_store import TrajectoryStore

@@ -23,8 +23,8 @@ from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.render import render
 from pipeline.rendering.renderer import LastScene
-from pipeline.run import outcome
-from pipeline.run.outcome import outdated
+from pipeline.run.outcome import join_kinds, outdated
+from pipeline.run.progress import rejections
 from pipeline.run.render_job import RenderJob
 from pipeline.run.render_stage import STREAMS_OF_A_JOB, portions, render_plan
 from pipeline.stores.frame_store import FrameStore, frames_by_trajectory
@@ -103,13 +103,13 @@ def test_finished_work_is_generated_again_only_where_that_was_allowed(
     next_recipe(step)
     number = f"recipe of {step} {identity.RECIPES[step] - 1}, here {identity.RECIPES[step]}"
     found = outdated(rows, TrajectoryStore(stored.root), FrameStore(store.root, config.render))
-    told = {f"files of frames, generated with {number}": 1}
-    assert found == told | ({f"trajectories, generated with {number}": 1} if step == "physics" else {})
+    told = {"files of frames": {number: 1}}
+    assert found == told | ({"trajectories": {number: 1}} if step == "physics" else {})
     with pytest.raises(PipelineError, match=rf"1 files of frames, generated with {number}(?s:.*)REMAKE=1` before"):
-        identity.reject_unasked(found, tmp_path)
+        identity.reject_unasked(join_kinds(found), tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
     monkeypatch.setenv(identity.REMAKE, "1")
-    identity.reject_unasked(found, tmp_path)
+    identity.reject_unasked(join_kinds(found), tmp_path)
     assert number in capsys.readouterr().out
     if step == "pixels":
         monkeypatch.delenv(identity.REMAKE)
@@ -130,7 +130,7 @@ def test_what_the_user_changed_is_made_without_a_question(
     assert not changed.rows()
     assert not outdated(rows, stored, changed, gl.choose().device)
     device = outdated(rows, stored, store, "another device")
-    assert device == {f"files of frames, generated with OpenGL device {gl.choose().device}, here another device": 1}
+    assert device == {"files of frames": {f"OpenGL device {gl.choose().device}, here another device": 1}}
     assert not outdated([], stored, store), "a file that no episode of today's plan needs"
 
 
@@ -156,9 +156,7 @@ def test_rendering_ends_when_all_streams_of_a_trajectory_are_rejected(
     (shown,) = stored.values()
     assert shown.streams == set()
     assert len(shown.rejected) == 4, "two views of the light episode and of its reserve"
-    assert outcome.rejections(lights, stored, STANDARD.views) == dict.fromkeys(
-        (row.episode_id for row in lights), "too_dark"
-    )
+    assert rejections(lights, stored, STANDARD.views) == dict.fromkeys((row.episode_id for row in lights), "too_dark")
     rendered = len(passes)
     render_into(tmp_path, lights, config, replayed, counted)
     assert len(passes) == rendered, "a second run has nothing to do"
@@ -289,16 +287,14 @@ def test_a_rendering_that_is_given_up_is_dropped_with_its_reason_and_keeps_what_
 ) -> None:
     render_into(tmp_path / "at_once", rows, config, replayed, given_up)
     stored = frames_by_trajectory(FrameStore(tmp_path / "at_once", config.render).rows())
-    assert set(outcome.rejections(rows, stored, STANDARD.views).values()) == {"worker_lost"}
+    assert set(rejections(rows, stored, STANDARD.views).values()) == {"worker_lost"}
     render_into(tmp_path / "at_once", rows, config, replayed, nothing_to_do)
 
     twin, lights = rows[:1], without_twins(rows)
     render_into(tmp_path / "later", twin, config, replayed, loop)
     render_into(tmp_path / "later", rows, config, replayed, given_up)
     stored = frames_by_trajectory(FrameStore(tmp_path / "later", config.render).rows())
-    assert outcome.rejections(rows, stored, STANDARD.views) == dict.fromkeys(
-        (row.episode_id for row in lights), "worker_lost"
-    )
+    assert rejections(rows, stored, STANDARD.views) == dict.fromkeys((row.episode_id for row in lights), "worker_lost")
     assert len(stored[twin[0].trajectory_id].streams) == 2, "the twin's own frames stay"
 
 
@@ -332,7 +328,5 @@ def test_a_rejection_of_a_reserve_that_is_no_longer_needed_is_forgotten(
         FrameStore(tmp_path, config.render),
         given_up,
     )
-    assert outcome.rejections(rows, frames_by_trajectory(store.rows()), STANDARD.views) == {
-        rows[2].episode_id: "worker_lost"
-    }
+    assert rejections(rows, frames_by_trajectory(store.rows()), STANDARD.views) == {rows[2].episode_id: "worker_lost"}
     assert render_into(tmp_path, rows, config, replayed, loop) == expected

@@ -25,8 +25,8 @@ from pipeline.compute.pool import loop
 from pipeline.config import Config, FilterConfig
 from pipeline.errors import PipelineError
 from pipeline.planning import plan, selection
-from pipeline.run import outcome
-from pipeline.run.outcome import outdated
+from pipeline.run.outcome import outdated, reject_missing_replays
+from pipeline.run.progress import Progress
 from pipeline.run.replay_stage import Replays
 from pipeline.run.verdicts import verdicts_of
 from pipeline.seeding import rng
@@ -133,6 +133,12 @@ def _rewrite(file: Path, change: Callable[[dict[str, bytes]], object]) -> None:
             archive.writestr(name, content)
 
 
+def reject_missing(config: Config, rows: list[plan.Row], trajectories: Path) -> None:
+    """Stop if a trajectory of a plan is missing, as the stages after ``replay`` do."""
+    store = TrajectoryStore(trajectories)
+    reject_missing_replays(Progress.of(rows, store.rows(), {}, config), store)
+
+
 def _take_out_states(file: Path) -> None:
     _rewrite(file, lambda members: members.pop("states.npy"))
 
@@ -148,7 +154,7 @@ def test_a_damaged_trajectory_is_an_error_with_its_reason_and_is_never_silently_
     for read in (
         lambda: TrajectoryStore(trajectories).row(file.stem),
         lambda: TrajectoryStore(trajectories).load(file.stem),
-        lambda: outcome.read_replays(rows, TrajectoryStore(trajectories), {}, FilterConfig()),
+        lambda: reject_missing(config, rows, trajectories),
         lambda: Replays(config.demos, config.replay, TrajectoryStore(trajectories), nothing_to_do).complete(rows),
     ):
         with pytest.raises(
@@ -169,10 +175,10 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     before = file.read_bytes()
     fault(file)
     with pytest.raises(PipelineError, match=rf"(?s){file.name}.*stages/replay.py CONFIG"):
-        outcome.read_replays(rows, TrajectoryStore(trajectories), {}, FilterConfig())
+        reject_missing(config, rows, trajectories)
     Replays(config.demos, config.replay, TrajectoryStore(trajectories), loop).complete(rows)
     assert file.read_bytes() == before
-    assert outcome.read_replays(rows, TrajectoryStore(trajectories), {}, FilterConfig())
+    reject_missing(config, rows, trajectories)
 
 
 @pytest.mark.parametrize("error", [MemoryError("mine"), KeyError("mine"), ValueError("mine"), OSError("mine")])
@@ -285,9 +291,7 @@ def test_files_that_nobody_wrote_down_what_they_were_made_with_are_not_replaced_
     """As those of the versions before."""
     run = run_in(trajectories.parent)
     _make_foreign(next(trajectories.glob("*.npz")))
-    assert outdated(rows, run.trajectories, run.frames) == {
-        "trajectories, generated with unrecorded versions and settings": 1
-    }
+    assert outdated(rows, run.trajectories, run.frames) == {"trajectories": {"unrecorded versions and settings": 1}}
     _shorten(next(trajectories.glob("*.npz")))
     with pytest.raises(PipelineError, match="damaged"):
         outdated(rows, run.trajectories, run.frames)
@@ -300,11 +304,8 @@ def test_hdf5_files_of_an_earlier_version_are_not_replaced_unasked(rows: list[pl
     frames = trajectories.parent / "frames" / file.stem / "0123.h5"
     frames.parent.mkdir(parents=True)
     frames.write_bytes(b"frames of an earlier version")
-    earlier = "generated with the HDF5 container of an earlier version"
-    assert outdated(rows, run.trajectories, run.frames) == {
-        f"trajectories, {earlier}": 1,
-        f"files of frames, {earlier}": 1,
-    }
+    earlier = {"the HDF5 container of an earlier version": 1}
+    assert outdated(rows, run.trajectories, run.frames) == {"trajectories": earlier, "files of frames": earlier}
 
 
 def test_the_table_no_longer_tells_of_a_file_that_is_gone(trajectories: Path) -> None:
@@ -327,4 +328,4 @@ def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_agai
     assert Replays(config.demos, config.replay, TrajectoryStore(tmp_path), nothing_to_do).complete(rows) == judged
     assert {verdict.reason for verdict in selection.select(rows, judged).values()} == {"worker_lost"}
     assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
-    assert outcome.read_replays(rows, TrajectoryStore(tmp_path), {}, FilterConfig())
+    reject_missing(config, rows, tmp_path)

@@ -22,7 +22,8 @@ from pipeline.formats.lerobot import LeRobot, LeRobotV21, LeRobotV21Config
 from pipeline.formats.lerobot.video import Video
 from pipeline.formats.read_back import Fault
 from pipeline.run import manifest
-from pipeline.run.export import episodes_of, export
+from pipeline.run.dataset_basis import episodes_of
+from pipeline.run.export import export
 from pipeline.run.run import Run
 from pipeline.validation.validate import EpisodesJob
 
