@@ -68,7 +68,7 @@ def executed(env: Any, done: Done, actions: Floats, *, use_delta: bool) -> tuple
     controller.use_delta = use_delta
     positions_m = []
     for number, action in enumerate(actions, 1):
-        push = done.scene.push
+        push = done.scene.start.push
         if push is not None:
             acts = push.first_step < number <= push.first_step + push.steps
             env.sim.data.xfrc_applied[env.sim.model.body_name2id(push.body)] = push.wrench if acts else 0.0

@@ -23,9 +23,9 @@ def first_posture(scene: Scene, model: mujoco.MjModel) -> Floats:
     The orientation of the grip in this posture is the controller's goal until an action turns the hand.
     """
     state = scene.state.copy()
-    if scene.posture_rad is not None:
+    if scene.start.posture_rad is not None:
         addresses = [int(model.joint(name).qposadr[0]) for name in ARM]
-        State.of(state, model.nq).qpos[addresses] = scene.posture_rad
+        State.of(state, model.nq).qpos[addresses] = scene.start.posture_rad
     return state
 
 

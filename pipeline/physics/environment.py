@@ -149,25 +149,25 @@ class Environment:
             self._reset_in_place()
         robot = env.robots[0]
         # One number for each finger; robosuite's gripper keeps its last command over the reset.
-        robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
+        robot.gripper.current_action = scene.start.gripper * np.array([-1.0, 1.0])
         env.sim.reset()
         self._check_state(scene.state)
         env.sim.set_state_from_flattened(scene.state)
-        if scene.posture_rad is not None:
-            env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
+        if scene.start.posture_rad is not None:
+            env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.start.posture_rad
             env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
         env.sim.forward()
         # After a reset in an evaluation, the controller knows the arm's posture. Its null space pulls the arm to this
         # posture, not to robosuite's home posture. Do the same here.
         robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
-        if scene.posture_rad is not None:
+        if scene.start.posture_rad is not None:
             # LIBERO-Plus sets an initial state after a reset with another posture. Until the end of the first substep,
             # its controller still uses the posture of the reset. Do the same here.
             env.sim.set_state_from_flattened(scene.state)
             env.sim.forward()
         env._post_process()
         self._control_step = ControlStep(env)
-        self._push, self._steps = scene.push, 0
+        self._push, self._steps = scene.start.push, 0
 
     def settle(self, steps: int) -> None:
         """Keep the arm still, with the gripper open, for some control steps, while arm and objects come to rest.
