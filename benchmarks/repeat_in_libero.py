@@ -155,7 +155,7 @@ def put_in(env: Any, scene: Scene) -> None:
     """
     env.reset_from_xml_string(scene.model_xml)
     sim, robot = env.sim, env.robots[0]
-    arm, speeds = robot._ref_joint_pos_indexes, robot._ref_joint_vel_indexes
+    arm, speeds = robot.controller.qpos_index, robot.controller.qvel_index
     # The last gripper command of both fingers.
     robot.gripper.current_action = scene.start.gripper * np.array([-1.0, 1.0])
     sim.reset()
