@@ -59,14 +59,14 @@ def replay(
         mode = "tracked" if replay_config.mode == "tracked" and reference() is not None else "open_loop"
         # The first state alone is stored.
         executed = _execute(environment, scene, 0, lambda: iter(()))
-        return Trajectory(trajectory_id, mode, scene, *executed._replace(verdict=rejected))
+        return Trajectory(trajectory_id, mode, scene, **executed._replace(verdict=rejected)._asdict())
 
     def replay_by(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         executed = _execute(environment, scene, replay_config.settle_steps, policy)
         fault = _fault_of(perturbations, executed.actions) if executed.verdict.kept else None
         if fault is not None:
             executed = executed._replace(verdict=Verdict(False, fault))
-        return Trajectory(trajectory_id, mode, scene, *executed)
+        return Trajectory(trajectory_id, mode, scene, **executed._asdict())
 
     # Recorded actions do not work against a push, so mode ``auto`` tracks pushed scenes even if they reach the goal.
     tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and scene.start.push is not None)
@@ -96,7 +96,7 @@ def _without_simulation(demo: Demo, trajectory_id: str, error: UnusableSceneErro
 
 
 class _Executed(NamedTuple):
-    """Fields of a ``Trajectory`` that come from the simulation, in their order."""
+    """Fields of a ``Trajectory`` that come from the simulation."""
 
     states: Floats
     actions: Floats
