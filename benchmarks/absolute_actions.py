@@ -12,6 +12,7 @@ successful, and the largest distances (median and maximum over trajectories) bet
 import argparse
 import json
 import sys
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,9 @@ import numpy as np
 from repeat_in_libero import STEP_S, Done, of_run, opened, put_in
 
 from pipeline.machine_code import ensure_fixed_machine_code
-from pipeline.physics.controller_goals import absolute_actions, replayed_grips
-from pipeline.types import Floats
+from pipeline.physics.controller_goals import absolute_actions, first_posture
+from pipeline.scenes.compiled import CompiledScene, GripPose, grip_pose
+from pipeline.types import Floats, Scene
 
 
 def main() -> None:
@@ -54,6 +56,16 @@ def main() -> None:
     print(json.dumps(figures))
 
 
+def replayed_grips(scene: Scene, states: Iterable[Floats]) -> tuple[GripPose, list[GripPose]]:
+    """Compile a scene, and return the grip's pose in ``first_posture`` and in each flattened state (S,)."""
+    compiled = CompiledScene(scene)
+    grips = []
+    for state in (first_posture(scene, compiled.model), *states):
+        compiled.restore(state)
+        grips.append(grip_pose(compiled.data))
+    return grips[0], grips[1:]
+
+
 def executed(env: Any, done: Done, actions: Floats, *, use_delta: bool) -> tuple[bool, Floats]:
     """Execute goals or deltas (K, 7).
 
@@ -68,7 +80,7 @@ def executed(env: Any, done: Done, actions: Floats, *, use_delta: bool) -> tuple
     controller.use_delta = use_delta
     positions_m = []
     for number, action in enumerate(actions, 1):
-        push = done.scene.push
+        push = done.scene.start.push
         if push is not None:
             acts = push.first_step < number <= push.first_step + push.steps
             env.sim.data.xfrc_applied[env.sim.model.body_name2id(push.body)] = push.wrench if acts else 0.0

@@ -112,16 +112,16 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
         env.env.modify_observable(f"{spec.camera}_image", "enabled", False)
     # A replay restores more than the state, see pipeline/physics/environment.py.
     robot, scene = env.env.robots[0], trajectory.scene
-    robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
+    robot.gripper.current_action = scene.start.gripper * np.array([-1.0, 1.0])
     env.sim.reset()
     # MuJoCo begins its search for the contact forces at the last ones, so they are computed as often as in a replay.
     env.sim.set_state_from_flattened(scene.state)
-    if scene.posture_rad is not None:
-        env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
+    if scene.start.posture_rad is not None:
+        env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.start.posture_rad
         env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
     env.sim.forward()
     robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
-    if scene.posture_rad is not None:
+    if scene.start.posture_rad is not None:
         env.set_init_state(scene.state)
     for _ in range(config.replay.settle_steps):
         env.step(DUMMY_ACTION)

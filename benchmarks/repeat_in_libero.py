@@ -28,7 +28,7 @@ import numpy as np
 
 from pipeline.axes import task_of
 from pipeline.formats.hdf5.layout import START_STATE
-from pipeline.formats.hdf5.read import start_of
+from pipeline.formats.hdf5.read import scene_of
 from pipeline.libero import hdf5
 from pipeline.libero.carried import bddl_text
 from pipeline.libero.demonstrations import HDF5Source
@@ -108,7 +108,7 @@ def _exported_start(file: Path, demo: Demo) -> Scene | None:
         group = content["data"][demo.key]
         if START_STATE not in group.attrs:
             return None
-        return replace(start_of(group), model_xml=str(demo.model_xml))
+        return replace(scene_of(dict(group.attrs)), model_xml=str(demo.model_xml))
 
 
 def opened(task: Task) -> Any:
@@ -138,7 +138,7 @@ def repeated(env: Any, done: Done) -> str | None:
     if not np.array_equal(env.get_sim_state(), done.states[0]):
         return f"another first observation after {settled} steps"
     for number, action in enumerate(done.actions, 1):
-        push = done.scene.push
+        push = done.scene.start.push
         if push is not None:
             acts = push.first_step < number <= push.first_step + push.steps
             env.sim.data.xfrc_applied[env.sim.model.body_name2id(push.body)] = push.wrench if acts else 0.0
@@ -155,16 +155,16 @@ def put_in(env: Any, scene: Scene) -> None:
     """
     env.reset_from_xml_string(scene.model_xml)
     sim, robot = env.sim, env.robots[0]
-    arm, speeds = robot._ref_joint_pos_indexes, robot._ref_joint_vel_indexes
+    arm, speeds = robot.controller.qpos_index, robot.controller.qvel_index
     # The last gripper command of both fingers.
-    robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
+    robot.gripper.current_action = scene.start.gripper * np.array([-1.0, 1.0])
     sim.reset()
     env.set_state(scene.state)
-    if scene.posture_rad is not None:
-        sim.data.qpos[arm], sim.data.qvel[speeds] = scene.posture_rad, 0.0
+    if scene.start.posture_rad is not None:
+        sim.data.qpos[arm], sim.data.qvel[speeds] = scene.start.posture_rad, 0.0
     sim.forward()
     robot.controller.update_initial_joints(sim.data.qpos[arm])
-    if scene.posture_rad is not None:
+    if scene.start.posture_rad is not None:
         env.set_init_state(scene.state)
 
 

@@ -144,7 +144,7 @@ def _displaced_cm(
     for row in rows:
         if row.axis == "disturbance" and replayed[row.trajectory_id]["kept"]:
             pushed, twin = store.load(row.trajectory_id), store.load(twins[row.demo_id])
-            push = pushed.scene.push
+            push = pushed.scene.start.push
             assert push is not None
             steps = slice(push.first_step, min(push.first_step + push.steps + 10, len(twin.actions)))
             hand_pushed = Reference.of(pushed.model_xml, pushed.states[steps], pushed.actions[steps])

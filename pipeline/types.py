@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NewType
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler, TypeAdapter, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -160,14 +160,12 @@ class Push(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Start of a replay.
+class Start:
+    """Conditions of a replay's start that are not part of a MuJoCo state.
+
+    Every store and dataset contains all fields, by ``to_json`` and ``of``.
 
     Attributes:
-        model_xml: MJCF with asset paths of this machine.
-        state: (S,) flattened MuJoCo state: time, qpos, qvel.
-        resolved: axis to the JSON-serialisable result of its perturbation in this scene, such as final object
-            positions.
         gripper: current gripper command: -1 open, 1 closed, 0 as after LIBERO's reset. The next action is added to it,
             so the change from 0 to -1 takes four control steps.
         posture_rad: (7,) joint angles of the reset that came before the state was set. The controller's null space
@@ -176,12 +174,53 @@ class Scene:
         push: force on the robot during the episode, independent of the actions.
     """
 
+    gripper: float
+    posture_rad: tuple[float, ...] | None = None
+    push: Push | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the JSON-serialisable values of the fields.
+
+        Gripper and posture are always present. Other fields are present if they differ from their default, so files
+        without them keep the bytes of versions without these fields.
+        """
+        always = {"gripper": self.gripper, "posture_rad": self.posture_rad}
+        changed: dict[str, Any] = _START.dump_python(self, exclude_defaults=True)
+        return always | changed
+
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> Start:
+        """Return the start with the values that ``to_json`` returned, before or after a file stored them.
+
+        Raises:
+            ValueError: if a value is missing or has another type.
+        """
+        try:
+            return _START.validate_python(dict(stored))
+        except ValidationError as error:
+            faults = [f"{fault['loc'][0]}: {fault['msg']}" for fault in error.errors()]
+            raise ValueError(f"a start is not valid, {'; '.join(faults)}") from error
+
+
+_START = TypeAdapter(Start)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Scene that a replay starts in.
+
+    Attributes:
+        model_xml: MJCF with asset paths of this machine.
+        state: (S,) flattened MuJoCo state: time, qpos, qvel.
+        resolved: axis to the JSON-serialisable result of its perturbation in this scene, such as final object
+            positions.
+        start: gripper command, posture of the controller and push; by default as after LIBERO's reset.
+    """
+
     model_xml: str
     state: Floats
     resolved: Mapping[str, Any] = field(default_factory=dict)
-    gripper: float = 0.0
-    posture_rad: tuple[float, ...] | None = None
-    push: Push | None = None
+    start: Start = Start(gripper=0.0)
 
 
 RollOut = Callable[[Scene, Demo], Floats]

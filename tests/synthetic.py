@@ -25,7 +25,7 @@ from pipeline.formats.hdf5 import Hdf5, Hdf5Config
 from pipeline.formats.lerobot import LeRobot, LeRobotConfig, LeRobotV21, LeRobotV21Config
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.run.export import export
-from pipeline.types import Episode, Extra, Geometry, Jpeg, Push, Replay, Scene, Subtask
+from pipeline.types import Episode, Extra, Geometry, Jpeg, Push, Replay, Scene, Start, Subtask
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
@@ -90,10 +90,11 @@ def replay_of(action: NDArray[np.float32]) -> Replay:
     """Return a replay of these actions; its actions have the digits of double precision."""
     steps = len(action)
     rng = seeding.rng("test_writers", "replay", steps)
-    scene = Scene("<mujoco/>", rng.normal(size=30), gripper=-1.0, posture_rad=(0.1,) * 7)
     push = Push("robot0_link7", (1.0, 2.0, 3.0, 0.0, 0.0, 0.0), 2, 4)
+    start = Start(gripper=-1.0, posture_rad=(0.1,) * 7, push=push)
+    scene = Scene("<mujoco/>", rng.normal(size=30), start=start)
     actions = action.astype(np.float64)
-    return Replay(actions, rng.normal(size=(steps, 30)), replace(scene, push=push), "origin")
+    return Replay(actions, rng.normal(size=(steps, 30)), scene, "origin")
 
 
 def goals(state: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:

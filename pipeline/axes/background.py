@@ -140,11 +140,11 @@ class BackgroundPerturbation(RenderPerturbation):
 
     def distances_to(self, others: Sequence[BackgroundPerturbation]) -> Floats:
         """Return 0 for perturbations that share an image with this one, 1 for the others (N,)."""
-        images = self._images
-        return np.array([float(images.isdisjoint(perturbation._images)) for perturbation in others])
+        images = self.images
+        return np.array([float(images.isdisjoint(perturbation.images)) for perturbation in others])
 
     @property
-    def _images(self) -> set[str]:
+    def images(self) -> set[str]:
         """Hashes of the textures."""
         return {covering.sha256 for covering in self.coverings}
 

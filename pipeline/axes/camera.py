@@ -122,18 +122,18 @@ class CameraPerturbation(RenderPerturbation):
 
     def distances_to(self, others: Sequence[CameraPerturbation]) -> Floats:
         """Return the distances (N,) to other cameras, for any tasks."""
-        parameters = [perturbation._parameters() for perturbation in others]
+        parameters = [perturbation.parameters() for perturbation in others]
         return self._angles_deg(_embed(np.array(parameters)))
 
     def _angles_deg(self, cameras: _Cameras) -> Floats:
         """Return the distances (N,) to N cameras in degrees."""
-        camera = _embed(np.array([self._parameters()]))
+        camera = _embed(np.array([self.parameters()]))
         sphere = _angle_deg(cameras.rays @ camera.rays[0])
         turn = 2 * _angle_deg(np.abs(cameras.turns @ camera.turns[0]))
         dolly = np.rad2deg(np.abs(cameras.log_scales - camera.log_scales[0]))
         return np.asarray(np.maximum(np.maximum(sphere, turn), dolly))
 
-    def _parameters(self) -> tuple[float, ...]:
+    def parameters(self) -> tuple[float, ...]:
         """Return the values of ``PARAMETERS``."""
         return tuple(getattr(self, name) for name in PARAMETERS)
 

@@ -69,7 +69,8 @@ class DisturbancePerturbation(PhysicsPerturbation):
         if fault:
             raise RejectedError(fault)
         push = Push(self.body, self.wrench, self.first_step, self.steps)
-        return replace(scene, push=push, resolved={**scene.resolved, "disturbance": push._asdict()})
+        start = replace(scene.start, push=push)
+        return replace(scene, start=start, resolved={**scene.resolved, "disturbance": push._asdict()})
 
     def fault_of(self, actions: Floats) -> str | None:
         """Return the reason why the push does not fit the executed ``actions`` (K, 7), else ``None``.

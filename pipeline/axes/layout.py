@@ -91,16 +91,16 @@ class LayoutPerturbation(PhysicsPerturbation):
 
     def distances_to(self, others: Sequence[LayoutPerturbation]) -> Floats:
         """Return infinity for each perturbation that shares no category with this one, else 0 (N,)."""
-        return np.array([self._distance_to(perturbation._categories) for perturbation in others])
+        return np.array([self._distance_to(perturbation.categories) for perturbation in others])
 
     @property
-    def _categories(self) -> set[str]:
+    def categories(self) -> set[str]:
         """Categories of the added objects."""
         return {added.category for added in self.objects}
 
     def _distance_to(self, categories: Iterable[str]) -> float:
         """Return infinity if no added object has one of ``categories``, else 0."""
-        return math.inf if self._categories.isdisjoint(categories) else 0.0
+        return math.inf if self.categories.isdisjoint(categories) else 0.0
 
     def credits(self, task: Task) -> frozenset[Credit]:
         """List the added objects with their licences."""
@@ -187,7 +187,7 @@ class LayoutAxis(Axis):
             placed_at += [*_on_surface(placed, bddl.read(item.task.bddl_file).arena)]
         categories: set[str] = set()
         for item in kept:
-            categories |= item.perturbation._categories
+            categories |= item.perturbation.categories
         places = {BENCHMARK: np.unique(tested_at.reshape(-1, 2), axis=0), "layout": np.array(placed_at)}
         number = {
             BENCHMARK: np.array([float(task.parameters["count"]) for task in tested]),

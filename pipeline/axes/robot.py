@@ -79,8 +79,8 @@ class RobotPerturbation(PhysicsPerturbation):
         before = compiled.touching().keys()
         joints = [model.joint(name) for name in ARM]
         arm = [joint.qposadr[0] for joint in joints]
-        pulled = self.component == "controller_posture" and scene.posture_rad is not None
-        posture = (scene.posture_rad if pulled else data.qpos[arm]) + np.array(self.joint_offsets_rad)
+        pulled = self.component == "controller_posture" and scene.start.posture_rad is not None
+        posture = (scene.start.posture_rad if pulled else data.qpos[arm]) + np.array(self.joint_offsets_rad)
         low, high = np.array([joint.range for joint in joints]).T
         if (posture < low + LIMIT_MARGIN_RAD).any() or (posture > high - LIMIT_MARGIN_RAD).any():
             raise RejectedError("joint_limit")
@@ -95,11 +95,12 @@ class RobotPerturbation(PhysicsPerturbation):
 
             hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
             pulled_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
-            return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": pulled_to})
+            start = replace(scene.start, posture_rad=tuple(posture.tolist()))
+            return replace(scene, start=start, resolved={**scene.resolved, "robot": pulled_to})
         if compiled.touching().keys() - before:
             raise RejectedError("robot_in_collision")
         resolved = {**scene.resolved, "robot": {"joints_rad": posture.tolist()}}
-        return replace(scene, state=state, posture_rad=None, resolved=resolved)
+        return replace(scene, state=state, start=replace(scene.start, posture_rad=None), resolved=resolved)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the offsets of all robot tasks; all tasks share one arm."""

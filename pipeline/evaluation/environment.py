@@ -382,7 +382,7 @@ class EpisodeEnvironment:
             scene = recorded_start(demo, demo.model_xml or simulator.place_fixtures(seed))
             # A recording begins with an open gripper. LIBERO restores its own states after its reset, which leaves the
             # gripper without a command.
-            return scene if recorded else replace(scene, gripper=0.0)
+            return scene if recorded else replace(scene, start=replace(scene.start, gripper=0.0))
 
         scene = None
         if task.source == "own":

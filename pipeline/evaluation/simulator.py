@@ -18,6 +18,7 @@ from pipeline.libero.starts import SETTLING_STEPS
 from pipeline.machine_code import fixed_machine_code
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
+from pipeline.physics.robosuite_1_4 import copy_controller, data_of, finish_action, model_of, restore_controller
 from pipeline.physics.stepping import ControlStep
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
@@ -93,7 +94,7 @@ class Simulator(Environment):
     @property
     def model(self) -> mujoco.MjModel:
         """Return the model that LIBERO's last reset compiled, including textures."""
-        return self._env.sim.model._model
+        return model_of(self._env.sim)
 
     @property
     def controller(self) -> Any:
@@ -124,15 +125,15 @@ class Simulator(Environment):
         if saved is None or (seed, posture_rad) != (saved.seed, saved.posture_rad):
             self._reset(seed, posture_rad)
         else:
-            mujoco.mj_resetData(self.model, env.sim.data._data)
-            mujoco.mj_setState(self.model, env.sim.data._data, saved.physics, _PHYSICS)
+            mujoco.mj_resetData(self.model, data_of(env.sim))
+            mujoco.mj_setState(self.model, data_of(env.sim), saved.physics, _PHYSICS)
             env.sim.model.site_rgba[:] = saved.site_rgba
-            vars(env.robots[0].controller).update(_copied(saved.controller))
+            restore_controller(self.controller, saved.controller)
         env.robots[0].gripper.current_action = np.zeros(env.robots[0].gripper.dof)
         self._check_state(state)
         env.sim.set_state_from_flattened(state)
         env.sim.forward()
-        env._post_process()
+        finish_action(env)
         self._observe_from_here()
         self.settle(settling_steps)
 
@@ -162,9 +163,9 @@ class Simulator(Environment):
         env = self._env.env
         self._reset_under(seed, initial_qpos=None if posture_rad is None else np.array(posture_rad))
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
-        mujoco.mj_getState(self.model, env.sim.data._data, physics, _PHYSICS)
-        controller = _copied(vars(env.robots[0].controller))
-        self._rewind = _Rewind(seed, posture_rad, physics, env.sim.model.site_rgba.copy(), controller)
+        mujoco.mj_getState(self.model, data_of(env.sim), physics, _PHYSICS)
+        site_rgba, controller = env.sim.model.site_rgba.copy(), copy_controller(self.controller)
+        self._rewind = _Rewind(seed, posture_rad, physics, site_rgba, controller)
 
     def _observe_from_here(self) -> None:
         """Begin a new control step at the current state, and observe this state."""
@@ -183,7 +184,7 @@ class Simulator(Environment):
             RejectedError: ``simulation_unstable`` if numbers grow too large to compute with, and if MuJoCo has reset
                 the scene because of such numbers.
         """
-        data = self._env.sim.data._data
+        data = data_of(self._env.sim)
         qpos = data.qpos.copy()
         self.controller.use_delta = not absolute
         self._act_from_outside()
@@ -199,7 +200,7 @@ class Simulator(Environment):
         Args:
             qpos: (nq,) positions from which the data's geometry was computed, one substep before the data's own.
         """
-        data, names = self._env.sim.data._data, (*ARM, *FINGERS)
+        data, names = data_of(self._env.sim), (*ARM, *FINGERS)
         velocity = np.concatenate([data.joint(name).qvel for name in names])
         hand_wxyz = data.body("robot0_right_hand").xquat.copy()
         return Observed(qpos, self.site_alpha, *proprioception(data), hand_wxyz, velocity)
@@ -217,11 +218,6 @@ def _styles(images: Mapping[str, str]) -> dict[str, str]:
     for part, image in images.items():
         STYLE_MAPPING[part][image] = Path(image).name
     return {f"{part}_style": image for part, image in images.items()}
-
-
-def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
-    """Copy attributes, including their arrays."""
-    return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in attributes.items()}
 
 
 class Picture:

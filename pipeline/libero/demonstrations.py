@@ -454,7 +454,17 @@ class _Recorded(NamedTuple):
         if self.model_file is not None:
             model_xml = as_defined(relocate(self.model_file, where=f"{where} model_file"), self.task)
         all_states = states if len(states) == len(actions) else None
-        return Demo(*self[:4], content.hexdigest(), executed, states[0].copy(), all_states, model_xml)
+        return Demo(
+            task=self.task,
+            key=self.key,
+            source=self.source,
+            origin=self.origin,
+            sha256=content.hexdigest(),
+            actions=executed,
+            init_state=states[0].copy(),
+            states=all_states,
+            model_xml=model_xml,
+        )
 
 
 def _suites_with(name: str) -> list[str]:

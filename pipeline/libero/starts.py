@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.types import Demo, Floats, Scene
+from pipeline.types import Demo, Floats, Scene, Start
 
 HOME_RAD = np.array([0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4])
 """Joint angles (7,) of the arm after LIBERO's reset, before noise."""
@@ -35,12 +35,11 @@ def recorded_start(demo: Demo, model_xml: str, settles: bool = True) -> Scene:
     """
     # A flattened state has the time, then the arm's seven joints.
     near = float(np.linalg.norm(demo.init_state[1:8] - HOME_RAD)) <= SCATTER_RAD
-    return Scene(
-        model_xml,
-        demo.init_state,
+    start = Start(
         gripper=1.0 if demo.actions[0, 6] > 0 else -1.0,
         posture_rad=tuple(HOME_RAD.tolist()) if settles and near else None,
     )
+    return Scene(model_xml, demo.init_state, start=start)
 
 
 def kept_actions(actions: Floats, noops: str) -> NDArray[np.bool_]:

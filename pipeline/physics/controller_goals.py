@@ -1,13 +1,13 @@
 """Goals that an episode's actions set for the controller, as robosuite's OSC_POSE computes them from deltas."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.scenes.compiled import ARM, CompiledScene, GripPose, grip_pose
+from pipeline.scenes.compiled import ARM, GripPose
 from pipeline.types import Floats, Scene, State
 
 FIRST_SIDE = np.array([1.0, 0.1, 0.01])
@@ -23,9 +23,9 @@ def first_posture(scene: Scene, model: mujoco.MjModel) -> Floats:
     The orientation of the grip in this posture is the controller's goal until an action turns the hand.
     """
     state = scene.state.copy()
-    if scene.posture_rad is not None:
+    if scene.start.posture_rad is not None:
         addresses = [int(model.joint(name).qposadr[0]) for name in ARM]
-        State.of(state, model.nq).qpos[addresses] = scene.posture_rad
+        State.of(state, model.nq).qpos[addresses] = scene.start.posture_rad
     return state
 
 
@@ -70,18 +70,3 @@ def without_jumps(axis_angles: Floats) -> Floats:
         former = axis_angle
         continuous.append(former)
     return np.stack(continuous)
-
-
-def replayed_grips(scene: Scene, states: Iterable[Floats]) -> tuple[GripPose, list[GripPose]]:
-    """Compile a scene, and return the grip's pose in ``first_posture`` and in each flattened state (S,).
-
-    Raises:
-        ValueError: if MuJoCo rejects the scene.
-    """
-    compiled = CompiledScene(scene)
-
-    def in_state(state: Floats) -> GripPose:
-        compiled.restore(state)
-        return grip_pose(compiled.data)
-
-    return in_state(first_posture(scene, compiled.model)), [in_state(state) for state in states]

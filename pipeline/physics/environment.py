@@ -18,6 +18,7 @@ from pipeline.libero.arenas import SURFACES
 from pipeline.libero.assets import as_evaluated
 from pipeline.libero.carried import definition_of
 from pipeline.physics.control_env import control_env, seeded, until_placed
+from pipeline.physics.robosuite_1_4 import data_of, finish_action, model_of
 from pipeline.physics.stepping import ControlStep
 from pipeline.physics.without_images import images_left_out
 from pipeline.scenes.compiled import compile_for_physics, fixed_pose, grip_pose
@@ -148,26 +149,27 @@ class Environment:
             env.sim.model.site_rgba[:] = self._site_rgba
             self._reset_in_place()
         robot = env.robots[0]
+        arm_qpos, arm_qvel = robot.controller.qpos_index, robot.controller.qvel_index
         # One number for each finger; robosuite's gripper keeps its last command over the reset.
-        robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
+        robot.gripper.current_action = scene.start.gripper * np.array([-1.0, 1.0])
         env.sim.reset()
         self._check_state(scene.state)
         env.sim.set_state_from_flattened(scene.state)
-        if scene.posture_rad is not None:
-            env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
-            env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
+        if scene.start.posture_rad is not None:
+            env.sim.data.qpos[arm_qpos] = scene.start.posture_rad
+            env.sim.data.qvel[arm_qvel] = 0.0
         env.sim.forward()
         # After a reset in an evaluation, the controller knows the arm's posture. Its null space pulls the arm to this
         # posture, not to robosuite's home posture. Do the same here.
-        robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
-        if scene.posture_rad is not None:
+        robot.controller.update_initial_joints(env.sim.data.qpos[arm_qpos])
+        if scene.start.posture_rad is not None:
             # LIBERO-Plus sets an initial state after a reset with another posture. Until the end of the first substep,
             # its controller still uses the posture of the reset. Do the same here.
             env.sim.set_state_from_flattened(scene.state)
             env.sim.forward()
-        env._post_process()
+        finish_action(env)
         self._control_step = ControlStep(env)
-        self._push, self._steps = scene.push, 0
+        self._push, self._steps = scene.start.push, 0
 
     def settle(self, steps: int) -> None:
         """Keep the arm still, with the gripper open, for some control steps, while arm and objects come to rest.
@@ -226,7 +228,7 @@ class Environment:
         Raises:
             UnusableSceneError: ``state_mismatch`` for another length or a rotation of length 0.
         """
-        model = self.sim.model._model
+        model = model_of(self.sim)
         expected = 1 + model.nq + model.nv
         if len(state) != expected:
             what = f"the recorded state has {len(state)} numbers, the scene's has {expected}"
@@ -260,14 +262,14 @@ class Environment:
         except (np.linalg.LinAlgError, mujoco.FatalError) as error:
             raise RejectedError("simulation_unstable") from error
         # After too large accelerations, MuJoCo resumes from the model's own pose and raises nothing.
-        if self.sim.data._data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+        if data_of(self.sim).warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             raise RejectedError("simulation_unstable")
 
     def _act_from_outside(self) -> None:
         """Begin or end the scene's push, and count the step that follows."""
         if self._push is not None:
             acts = self._push.first_step <= self._steps < self._push.first_step + self._push.steps
-            self.sim.data._data.body(self._push.body).xfrc_applied[:] = self._push.wrench if acts else 0.0
+            data_of(self.sim).body(self._push.body).xfrc_applied[:] = self._push.wrench if acts else 0.0
         self._steps += 1
 
     @property
@@ -282,7 +284,7 @@ class Environment:
     @property
     def hand(self) -> tuple[Floats, Rotation]:
         """Return position (3,) in m and orientation of the grip site, in the world's frame."""
-        grip = grip_pose(self.sim.data._data)
+        grip = grip_pose(data_of(self.sim))
         return grip.position_m, Rotation.from_matrix(grip.rotation)
 
     def pose(self, name: str) -> Floats:
@@ -291,7 +293,7 @@ class Environment:
         Args:
             name: the thing's name in the BDDL file.
         """
-        data = self.sim.data._data
+        data = data_of(self.sim)
         joint = f"{name}_joint0"
         if joint in self.sim.model.joint_names:
             return np.array(data.joint(joint).qpos)
@@ -313,7 +315,10 @@ class Environment:
 
     def satisfies(self, goal: Iterable[Sequence[str]]) -> bool:
         """Return whether all facts of a goal hold, such as the goal of another task in the same scene."""
-        return all(self._env.env._eval_predicate(list(fact)) for fact in goal)
+        from libero.libero.envs.predicates import eval_predicate_fn
+
+        states = self._env.env.object_states_dict
+        return all(eval_predicate_fn(predicate, *(states[name] for name in names)) for predicate, *names in goal)
 
     def close(self) -> None:
         self._env.close()

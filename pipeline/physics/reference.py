@@ -80,7 +80,14 @@ class Reference:
                 poses[name][step] = data.joint(f"{name}_joint0").qpos
             partners.append(_partners(compiled))
         contacts = _contacts(model, partners, poses, places)
-        return cls(positions, Rotation.from_matrix(matrices), actions, *contacts, poses, places)
+        return cls(
+            positions_m=positions,
+            rotations=Rotation.from_matrix(matrices),
+            actions=actions,
+            poses=poses,
+            places=places,
+            **contacts._asdict(),
+        )
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -107,7 +114,7 @@ def _renamed(by_name: Mapping[str, T], names: Mapping[str, str]) -> dict[str, T]
 
 
 class _Contacts(NamedTuple):
-    """Fields of a ``Reference`` that come from contacts, in their order."""
+    """Fields of a ``Reference`` that come from contacts."""
 
     busy: Mask
     engaged: Mask

@@ -22,7 +22,7 @@ from pipeline.machine_code import fixed_machine_code
 from pipeline.physics.environment import Environment, UnusableSceneError, environment_of
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Route, follow
-from pipeline.types import Demo, Floats, Push, Scene, Task, Trajectory, Verdict
+from pipeline.types import Demo, Floats, Scene, Start, Task, Trajectory, Verdict
 
 
 def replay(
@@ -59,17 +59,17 @@ def replay(
         mode = "tracked" if replay_config.mode == "tracked" and reference() is not None else "open_loop"
         # The first state alone is stored.
         executed = _execute(environment, scene, 0, lambda: iter(()))
-        return Trajectory(trajectory_id, mode, scene, *executed._replace(verdict=rejected))
+        return Trajectory(trajectory_id, mode, scene, **executed._replace(verdict=rejected)._asdict())
 
     def replay_by(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         executed = _execute(environment, scene, replay_config.settle_steps, policy)
         fault = _fault_of(perturbations, executed.actions) if executed.verdict.kept else None
         if fault is not None:
             executed = executed._replace(verdict=Verdict(False, fault))
-        return Trajectory(trajectory_id, mode, scene, *executed)
+        return Trajectory(trajectory_id, mode, scene, **executed._asdict())
 
     # Recorded actions do not work against a push, so mode ``auto`` tracks pushed scenes even if they reach the goal.
-    tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and scene.push is not None)
+    tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and scene.start.push is not None)
     followed = reference() if tracks else None
     if followed is None:
         recorded = demo.actions[kept_actions(demo.actions, replay_config.noops)]
@@ -96,7 +96,7 @@ def _without_simulation(demo: Demo, trajectory_id: str, error: UnusableSceneErro
 
 
 class _Executed(NamedTuple):
-    """Fields of a ``Trajectory`` that come from the simulation, in their order."""
+    """Fields of a ``Trajectory`` that come from the simulation."""
 
     states: Floats
     actions: Floats
@@ -213,19 +213,16 @@ def compute_settled_state(scene: Scene, task: Task, replay_config: ReplayConfig)
 def _states_from(scene: Scene, task: Task, actions: Floats, replay_config: ReplayConfig) -> Floats:
     """Execute actions from a settled scene and return the states (K+1, S), cached by the scene's content."""
     # A scene cannot be hashed; these are the parts of it that a replay depends on.
-    start = scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad, scene.push
-    return _states(task, start, actions.tobytes(), replay_config.settle_steps)
-
-
-_Start = tuple[str, bytes, float, tuple[float, ...] | None, Push | None]
+    parts = scene.model_xml, scene.state.tobytes(), scene.start
+    return _states(task, parts, actions.tobytes(), replay_config.settle_steps)
 
 
 @lru_cache(maxsize=4)
-def _states(task: Task, start: _Start, actions: bytes, settle_steps: int) -> Floats:
-    """Execute actions (the bytes of (K, 7) float64) from a settled start and return the states (K+1, S)."""
-    model_xml, state, gripper, posture_rad, push = start
+def _states(task: Task, scene_parts: tuple[str, bytes, Start], actions: bytes, settle_steps: int) -> Floats:
+    """Execute actions (the bytes of (K, 7) float64) from a settled scene and return the states (K+1, S)."""
+    model_xml, state, start = scene_parts
     environment = environment_of(task)
-    environment.restore(Scene(model_xml, np.frombuffer(state), gripper=gripper, posture_rad=posture_rad, push=push))
+    environment.restore(Scene(model_xml, np.frombuffer(state), start=start))
     environment.settle(settle_steps)
     states = [environment.state]
     for action in np.frombuffer(actions).reshape(-1, 7):

@@ -6,6 +6,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from pipeline.physics.robosuite_1_4 import data_of, finish_action, model_of
 from pipeline.types import Floats
 
 
@@ -34,7 +35,7 @@ class ControlStep:
         self._env = env
         robot = env.robots[0]
         self._controller, self._gripper = robot.controller, robot.gripper
-        self._model, self._data = env.sim.model._model, env.sim.data._data
+        self._model, self._data = model_of(env.sim), data_of(env.sim)
         self._substeps = int(env.control_timestep / env.model_timestep)
         self._site = env.sim.model.site_name2id(self._controller.eef_name)
         # The joints of an arm, which is a chain of bodies, have consecutive addresses.
@@ -43,9 +44,9 @@ class ControlStep:
         self._arm_dofs = slice(first_dof, first_dof + self._controller.joint_dim)
         self._jacobian, self._mass = np.empty((6, self._model.nv)), np.empty((self._model.nv, self._model.nv))
         self._positional, self._rotational = self._jacobian[:3], self._jacobian[3:]
-        self._arm_torque = robot._ref_joint_actuator_indexes
+        self._arm_torque = [env.sim.model.actuator_name2id(name) for name in robot.robot_model.actuators]
         self._low, self._high = robot.torque_limits
-        self._fingers = robot._ref_joint_gripper_actuator_indexes
+        self._fingers = [env.sim.model.actuator_name2id(name) for name in self._gripper.actuators]
         low, high = self._model.actuator_ctrlrange[self._fingers].T
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
 
@@ -77,7 +78,7 @@ class ControlStep:
             data.ctrl[self._fingers] = self._middle + self._half * self._gripper.format_action(action[6:])
             mujoco.mj_step2(model, data)
             yield
-        self._env._post_process()
+        finish_action(self._env)
 
     def _update(self) -> None:
         """Give the controller the values that its own ``update`` would read.

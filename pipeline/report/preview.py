@@ -74,7 +74,7 @@ class StagedTask:
         for physics in of_layer(perturbations, PhysicsPerturbation):
             scene = physics.apply(scene, demo, partial(roll_out, replay_config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
-        push = scene.push
+        push = scene.start.push
         if push is None:
             state = compute_settled_state(scene, demo.task, self.replay)
         else:
@@ -110,7 +110,7 @@ class StagedTask:
         reference = Reference.of(twin.model_xml, twin.states, twin.actions)
         changes = of_layer((perturbation,), PhysicsPerturbation)
         pushed = replay(environment_of(self.demo.task), self.demo, "pushed", self.replay, changes, lambda: reference)
-        push = pushed.scene.push
+        push = pushed.scene.start.push
         if push is None:
             raise RejectedError(pushed.verdict.reason)
         renderer, stream = self.opened.renderer(pushed.model_xml), Stream("image", ())

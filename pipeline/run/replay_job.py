@@ -63,7 +63,7 @@ class ReplayJob:
             replay_config = replay_config.model_copy(update={"mode": "tracked"})
         trajectory = replay(environment, start, self.row.trajectory_id, replay_config, physics, reference)
         # Open-loop actions do not work against a push either.
-        tracks = seed is not None or trajectory.scene.push is not None
+        tracks = seed is not None or trajectory.scene.start.push is not None
         if tracks and trajectory.verdict.kept and trajectory.mode != "tracked":
             trajectory = replace(trajectory, verdict=Verdict(False, "no_reference"))
         if trajectory.verdict.kept:

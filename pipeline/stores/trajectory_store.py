@@ -1,7 +1,7 @@
 """Replayed trajectories on disk, verdicts included."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,7 +12,7 @@ from pipeline.catalogue.scene_files import located, portable
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
 from pipeline.tables import columns_of
-from pipeline.types import Push, Quality, Scene, Trajectory, Verdict
+from pipeline.types import Quality, Scene, Start, Trajectory, Verdict
 
 
 class TrajectoryStore(Store):
@@ -49,10 +49,7 @@ class TrajectoryStore(Store):
             "mode": trajectory.mode,
             "resolved": trajectory.resolved,
             "quality": asdict(trajectory.quality) if trajectory.quality else None,
-            "gripper": scene.gripper,
-            "posture_rad": scene.posture_rad,
-            # Files without a push keep the bytes of versions that had no pushes.
-            **({} if scene.push is None else {"push": scene.push}),
+            **scene.start.to_json(),
         }
         arrays: dict[str, NDArray[Any]] = {
             "model_xml": np.frombuffer(portable(trajectory.model_xml).encode(), np.uint8),
@@ -71,15 +68,13 @@ class TrajectoryStore(Store):
                 scene.
         """
         with self.opened(trajectory_id) as file:
-            attributes = file.attributes
-            posture_rad, push, quality = attributes["posture_rad"], attributes.get("push"), attributes["quality"]
+            attributes, quality = file.attributes, file.attributes["quality"]
+            start = {each.name: attributes[each.name] for each in fields(Start) if each.name in attributes}
             scene = Scene(
                 model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
                 state=file.array("start"),
                 resolved=json.loads(attributes["resolved"]),
-                gripper=attributes["gripper"],
-                posture_rad=None if posture_rad is None else tuple(posture_rad),
-                push=None if push is None else Push(push[0], tuple(push[1]), *push[2:]),
+                start=Start.of(start),
             )
             return Trajectory(
                 trajectory_id,

@@ -129,8 +129,7 @@ def _replay(case: Case, copy: Copy) -> Iterator[Fault]:
     scene, expected = stored.scene, trajectory.scene
     if scene.model_xml != portable(expected.model_xml):
         yield case.finding(copy.dataset, "has another scene in model_file", "the scene of the replay")
-    start = (scene.gripper, scene.posture_rad, scene.push)
-    if not _same(scene.state, expected.state) or start != (expected.gripper, expected.posture_rad, expected.push):
+    if not _same(scene.state, expected.state) or scene.start != expected.start:
         yield case.finding(copy.dataset, "has another start", "the start of the replay")
     if stored.origin_sha256 != case.row["demo_origin_sha256"]:
         yield case.finding(copy.dataset, f"origin_sha256 is {stored.origin_sha256}", case.row["demo_origin_sha256"])

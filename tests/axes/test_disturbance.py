@@ -145,7 +145,7 @@ def test_the_hand_is_pushed_off_and_comes_back_to_the_goal(
     store = TrajectoryStore(tmp_path)
     store.save(kept)
     loaded = store.load("pushed")
-    assert loaded.scene.push == kept.scene.push
+    assert loaded.scene.start.push == kept.scene.start.push
     assert loaded.scene.resolved["disturbance"]["first_step"] == first_step
     assert np.array_equal(replayed(environment, twin, pushed_at(first_step, 80.0)).states, loaded.states)
 

@@ -169,8 +169,8 @@ def test_what_was_there_keeps_its_state_and_its_text_exactly(base: Scene, change
 
 
 def test_the_gripper_and_the_controller_start_as_without_the_objects(changed: Scene) -> None:
-    assert changed.gripper == -1.0
-    assert changed.posture_rad == tuple(HOME_RAD)
+    assert changed.start.gripper == -1.0
+    assert changed.start.posture_rad == tuple(HOME_RAD)
 
 
 def test_nothing_of_the_scene_s_physics_changed(base: Scene, changed: Scene) -> None:

@@ -191,8 +191,9 @@ def test_a_controllers_posture_pulls_the_arm_as_in_the_benchmark() -> None:
     change = RobotPerturbation(
         component="controller_posture", level=5, joint_offsets_rad=tuple((posture_rad - HOME_RAD).tolist())
     )
-    start = recorded_start(replace(starter_demo(PLATE), init_state=before), relocate(model_xml, "LIBERO"))
-    scene = change.apply(replace(start, gripper=0.0), starter_demo(PLATE), roll_out)
+    recorded = recorded_start(replace(starter_demo(PLATE), init_state=before), relocate(model_xml, "LIBERO"))
+    without_command = replace(recorded, start=replace(recorded.start, gripper=0.0))
+    scene = change.apply(without_command, starter_demo(PLATE), roll_out)
     assert np.array_equal(scene.state, before)
     ours.restore(scene)
     ours.settle(10)

@@ -324,7 +324,9 @@ DAMAGE: dict[str, tuple[Callable[[h5py.File], None], str, str]] = {
     "source": (set_attribute("expanded_from", "other/demo"), "provenance", "expanded_from is 'other/demo'"),
     "hash": (set_attribute("expanded_from_sha256", "0" * 64), "provenance", "expanded_from_sha256 is '000"),
     "scene": (set_attribute("model_file", "<mujoco model='other'/>"), "motion", "another scene"),
-    "start": (set_attribute("start_gripper", 1.0), "motion", "another start"),
+    "gripper": (set_attribute("start_gripper", 1.0), "motion", "another start"),
+    "posture": (set_attribute("start_posture_rad", np.zeros(7)), "motion", "another start"),
+    "push": (set_attribute("start_push", '["robot0_link7", [1, 2, 3, 0, 0, 0], 2, 5]'), "motion", "another start"),
     "origin": (set_attribute("origin_sha256", "other"), "motion", "origin_sha256"),
     "frame": (change("obs/agentview_rgb"), "jpeg", "image has other pixels at 1 steps, first at 1"),
     "further frames": (
@@ -367,9 +369,12 @@ def test_a_truncated_or_missing_file_is_named(written: Hdf5) -> None:
         written.open()
 
 
-def test_an_attribute_that_is_lost_is_named(written: Hdf5) -> None:
+@pytest.mark.parametrize(
+    ("attribute", "words"), [("start_state", "start_state"), ("start_gripper", "gripper: Field required")]
+)
+def test_an_attribute_that_is_lost_is_named(attribute: str, words: str, written: Hdf5) -> None:
     with h5py.File(written.folder / FILE, "r+") as file:
-        del file["data/demo_0"].attrs["start_state"]
+        del file["data/demo_0"].attrs[attribute]
     wanted: Row = row(IDS[0])
-    with pytest.raises(PipelineError, match=r"(?s)data/demo_0.*start_state"):
+    with pytest.raises(PipelineError, match=rf"(?s)data/demo_0.*{words}"):
         written.read(wanted)

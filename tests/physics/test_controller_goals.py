@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import PhysicsPerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
-from pipeline.physics.controller_goals import absolute_actions, replayed_grips, without_jumps
+from pipeline.physics.controller_goals import absolute_actions, first_posture, without_jumps
 from pipeline.physics.environment import environment_of
 from pipeline.physics.replay import replay
+from pipeline.scenes.compiled import CompiledScene, grip_pose
 from pipeline.seeding import rng
 
 
@@ -43,7 +44,12 @@ def test_goals_are_those_of_robosuites_controller(component: str) -> None:
         environment.step(action)
         positions_m.append(controller.goal_pos.copy())
         rotations.append(controller.goal_ori.copy())
-    goals = absolute_actions(actions, *replayed_grips(trajectory.scene, states))
+    compiled = CompiledScene(trajectory.scene)
+    grips = []
+    for state in (first_posture(trajectory.scene, compiled.model), *states):
+        compiled.restore(state)
+        grips.append(grip_pose(compiled.data))
+    goals = absolute_actions(actions, grips[0], grips[1:])
     np.testing.assert_allclose(goals[:, :3], positions_m, atol=1e-9)
     turned_rad = (Rotation.from_rotvec(goals[:, 3:6]).inv() * Rotation.from_matrix(rotations)).magnitude()
     assert turned_rad.max() < 1e-6

@@ -76,16 +76,13 @@ ORIENTATIONS = (
     ),
 )
 
-SHAPES = ("square", "stretched", "widened")
-"""Shapes of a picture: square; a square stretched to another height or width; a square and more of its surroundings."""
-
 
 class Variant(NamedTuple):
     """A picture with orientation, channels and shape undone.
 
     Attributes:
         swapped: True if red and blue were exchanged.
-        shape: one of ``SHAPES``.
+        shape: ``square``; ``stretched``, to another height or width; or ``widened``, by more of its surroundings.
         pixels: (S, S, 3) uint8; S is at most ``SIZE_PX``.
         smooth: the same, smoothed.
     """

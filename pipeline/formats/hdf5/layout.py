@@ -1,6 +1,10 @@
 """Names and conventions of an episode in LIBERO's HDF5 layout."""
 
+import json
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import ALL_VIEWS
 from pipeline.libero.carried import task_named
 from pipeline.libero.hdf5 import SUFFIX
-from pipeline.types import Floats, Task
+from pipeline.types import Floats, Start, Task
 
 VALIDATION_FOLDER = "val"
 """Folder of the files of the validation episodes; the files of all other episodes are next to it."""
@@ -17,12 +21,11 @@ PROVENANCE = "attributes of data/demo_<number>"
 
 INSTANCES, OBJECT_POSES = "instances", "obs/object_poses"
 
-START_STATE, START_GRIPPER = "start_state", "start_gripper"
-START_POSTURE, START_PUSH = "start_posture_rad", "start_push"
-"""Attributes with the start of the replay, before the arm and the objects settled: fields of ``types.Scene``.
+START_STATE = "start_state"
+"""Attribute with the state of the replay's start, before the arm and the objects settled."""
 
-A start without posture or push lacks the attribute.
-"""
+NUMERIC_START = ("gripper", "posture_rad")
+"""Fields of ``types.Start`` that are stored as numbers of HDF5; each other field is stored as JSON."""
 
 
 def file_of(task: str, split: str) -> str:
@@ -58,6 +61,29 @@ def maps_key(view: str, name: str) -> str:
 def matrix_attribute(view: str, name: str) -> str:
     """Return the attribute with a matrix of a view."""
     return f"{camera(view)}_{name}"
+
+
+def start_attributes(start: Start) -> dict[str, Any]:
+    """Return the attributes with a replay's start, such as ``start_gripper``; a field that is ``None`` has none."""
+    attributes: dict[str, Any] = {}
+    for name, value in start.to_json().items():
+        if value is not None:
+            attributes[f"start_{name}"] = np.array(value) if name in NUMERIC_START else json.dumps(value)
+    return attributes
+
+
+def start_of(attributes: Mapping[str, Any]) -> Start:
+    """Return the start of a replay from the attributes that ``start_attributes`` returned.
+
+    Raises:
+        ValueError: if a required attribute is missing, or a value has another type.
+    """
+    stored: dict[str, Any] = {}
+    for name in (field.name for field in fields(Start)):
+        value = attributes.get(f"start_{name}")
+        if value is not None:
+            stored[name] = value.tolist() if name in NUMERIC_START else json.loads(value)
+    return Start.of(stored)
 
 
 def turned_back(intrinsics: NDArray[np.floating], size_px: int) -> Floats:

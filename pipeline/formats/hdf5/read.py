@@ -20,7 +20,7 @@ from pipeline.formats.hdf5.write import REPEATED
 from pipeline.formats.read_back import Copy, Fault, in_both_splits, sampled, subtasks_of, unlike
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero import hdf5
-from pipeline.types import Episode, Extra, Frame, Geometry, Push, Replay, Scene
+from pipeline.types import Episode, Extra, Frame, Geometry, Replay, Scene
 
 FORMAT = "hdf5"
 
@@ -222,7 +222,7 @@ def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Cop
         instances=json.loads(attributes[layout.INSTANCES]) if content.has_names else (),
         rewrites=tuple(map(str, labels["rewrites"])),
         subtasks=subtasks_of(labels["subtask_starts"], labels["subtask_texts"]),
-        replay=Replay(actions, group["states"][()], start_of(group), str(attributes[hdf5.ORIGIN_SHA256])),
+        replay=Replay(actions, group["states"][()], scene_of(attributes), str(attributes[hdf5.ORIGIN_SHA256])),
     )
     decoded: dict[tuple[str, int], Frame] = {}
     for view in content.views:
@@ -241,22 +241,10 @@ def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Cop
     )
 
 
-def start_of(group: h5py.Group) -> Scene:
-    """Read the start of an episode's replay; its model has portable names of files."""
-    attributes = dict(group.attrs)
-    posture_rad, push = attributes.get(layout.START_POSTURE), attributes.get(layout.START_PUSH)
-    return Scene(
-        model_xml=str(attributes["model_file"]),
-        state=attributes[layout.START_STATE],
-        gripper=float(attributes[layout.START_GRIPPER]),
-        posture_rad=None if posture_rad is None else tuple(posture_rad.tolist()),
-        push=None if push is None else _push(json.loads(push)),
-    )
-
-
-def _push(stored: list[Any]) -> Push:
-    body, wrench, *times = stored
-    return Push(body, tuple(wrench), *times)
+def scene_of(attributes: Mapping[str, Any]) -> Scene:
+    """Return the scene in which an episode's replay starts; its model has portable names of files."""
+    model_xml, state = str(attributes["model_file"]), attributes[layout.START_STATE]
+    return Scene(model_xml, state, start=layout.start_of(attributes))
 
 
 def _plain(value: Any) -> Any:

@@ -62,17 +62,11 @@ def _recording(episode: Episode, content: Content) -> hdf5.Recording:
 
 def _start(replay: Replay) -> dict[str, Any]:
     """Return the attributes with which a replay can be repeated."""
-    scene = replay.scene
-    attributes: dict[str, Any] = {
+    return {
         hdf5.ORIGIN_SHA256: replay.origin_sha256,
-        layout.START_STATE: scene.state,
-        layout.START_GRIPPER: scene.gripper,
+        layout.START_STATE: replay.scene.state,
+        **layout.start_attributes(replay.scene.start),
     }
-    if scene.posture_rad is not None:
-        attributes[layout.START_POSTURE] = np.array(scene.posture_rad)
-    if scene.push is not None:
-        attributes[layout.START_PUSH] = json.dumps(scene.push)
-    return attributes
 
 
 def _images(episode: Episode, content: Content) -> dict[str, NDArray[Any]]:
