@@ -91,25 +91,6 @@ def write(file: Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def reject_other_file(path: Path, mark: str) -> None:
-    """Reject a file that a command would overwrite and did not write itself.
-
-    Args:
-        mark: text that all files of the command contain.
-
-    Raises:
-        PipelineError: naming the file.
-    """
-    if not os.path.lexists(path) or (path.is_file() and mark.encode() in path.read_bytes()):
-        return
-    raise PipelineError(
-        "the command did not write this file, and would overwrite it",
-        where=path,
-        expected="a new name, or a file that the same command wrote",
-        remedy="choose another name, or move the file to another place",
-    )
-
-
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to ``path``; on success sync it to disk and rename it to ``path``.

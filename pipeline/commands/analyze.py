@@ -17,7 +17,7 @@ from pipeline.commands.base import (
     result_paths_argument,
 )
 from pipeline.errors import PipelineError
-from pipeline.files import reject_other_file, write_json
+from pipeline.outputs import reject_other_file, write_json
 
 analyze = LazyGroup(
     "analyze",
@@ -88,7 +88,7 @@ def table(results: tuple[Path, ...], out: Path | None) -> None:
     from pipeline.report.paper_table import table_of
 
     if out is not None:
-        out = out.with_suffix("") if out.suffix in paper_rows.MARKS else out
+        out = out.with_suffix("") if out.suffix in paper_rows.SUFFIXES else out
         paper_rows.reject_other_tables(out)
     found = table_of(read_tested(results))
     print(paper_rows.markdown(found))
@@ -135,8 +135,8 @@ def gap(results: Path) -> None:
     from pipeline.evaluation.results import stored
 
     picture, findings = results / "gap.png", results / "gap.json"
-    reject_other_file(picture, composition.TITLE)
-    reject_other_file(findings, "papers_chi_square")
+    reject_other_file(picture)
+    reject_other_file(findings)
     measured = composition.pairs(stored([results]))
     composition.heatmap(measured, picture)
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
@@ -173,9 +173,9 @@ def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on
     from pipeline.evaluation import held_out
     from pipeline.evaluation.analyses import construction
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.task_list import reject_other_list, write_tasks
+    from pipeline.evaluation.task_list import write_tasks
 
-    reject_other_list(out)
+    reject_other_file(out)
     rows = [row for row, _ in stored(results)]
     plan = held_out.planned(open_run(trained_on).plan_file) if trained_on else None
     candidates = construction.candidates(seed)
@@ -195,9 +195,9 @@ def grade(folders: tuple[Path, ...], out: Path) -> None:
     """
     from pipeline.evaluation.analyses import grading
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.task_list import reject_other_list, write_tasks
+    from pipeline.evaluation.task_list import write_tasks
 
-    reject_other_list(out)
+    reject_other_file(out)
     results = [stored([folder]) for folder in folders]
     seeds: set[int] = set()
     for results_of_model in results:

@@ -131,9 +131,10 @@ def compare_frame(picture: Path, task: str, init_state: int, view: str, sheet: P
     from pipeline.evaluation.first_observation import frame_report
     from pipeline.evaluation.first_observation.start_frames import LastStartFrames
     from pipeline.libero.tasks import find_task, select_tasks
+    from pipeline.outputs import reject_other_file
 
     if sheet is not None:
-        frame_report.reject_existing(sheet)
+        reject_other_file(sheet)
     suite, _, name = task.partition("/")
     found = find_task(suite, name) if name else select_tasks([task])[0]
     with closing(LastStartFrames()) as opened:

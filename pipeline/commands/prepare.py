@@ -8,9 +8,6 @@ import click
 
 from pipeline.commands.base import PATH, Command, OneOf, config_argument, example, load_config
 
-PREVIEW = "perturbed-demos: preview"
-"""Comment in the pictures of `preview`, which marks files that it may overwrite."""
-
 EVERY = "all"
 """Argument in place of an axis, for one picture of each axis."""
 
@@ -120,34 +117,31 @@ def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
     axis. Several axes joined by +, such as camera+noise, change each frame together. With `all`, the picture shows a
     perturbation of a middle level on each axis next to the clean twin.
 
-    The picture is written to sheet.png or to the file of --out: a JPEG if its name ends in .jpg, else a PNG. Only a
-    picture of an earlier preview is overwritten. An axis that the configuration does not name has default ranges.
+    The picture is written to sheet.png or to the file of --out: a JPEG if its name ends in .jpg, else a PNG. An
+    existing file is overwritten only if it is a picture that a command wrote. An axis that the configuration does not
+    name has default ranges.
     """
-    from PIL.PngImagePlugin import PngInfo
-
     from pipeline import gl
     from pipeline.config import Config
-    from pipeline.files import reject_other_file, replaced
     from pipeline.libero.tasks import select_tasks
+    from pipeline.outputs import reject_other_file, written
     from pipeline.report import preview
     from pipeline.testset import benchmark
 
     settings = load_config(config) if config else Config.model_validate(DEFAULTS)
     chosen = select_tasks([task])
-    reject_other_file(out, PREVIEW)
+    reject_other_file(out)
     gl.choose()  # Without a working renderer, stop before slow work.
     stage = preview.staged(chosen, settings)
-    with replaced(out) as temporary:
+    with written(out) as temporary:
         if axis == EVERY:
             picture = preview.overview(stage, settings, benchmark.load())
         else:
             picture = preview.axis_sheet(stage, axis, settings, benchmark.load())
         if out.suffix == ".jpg":
-            picture.save(temporary, format="JPEG", quality=90, comment=PREVIEW)
+            picture.save(temporary, format="JPEG", quality=90)
         else:
-            metadata = PngInfo()
-            metadata.add_text("Software", PREVIEW)
-            picture.save(temporary, format="PNG", pnginfo=metadata)
+            picture.save(temporary, format="PNG")
         among = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
         print(f"wrote {out}, which shows {axis} on {stage.demo.demo_id}{among}")
 

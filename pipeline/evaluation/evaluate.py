@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from pipeline import gl
+from pipeline import gl, outputs
 from pipeline.axes import AXES
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
@@ -25,7 +25,7 @@ from pipeline.evaluation.setting_checks import check_policy_settings, check_sett
 from pipeline.evaluation.simulator import close_at_exit
 from pipeline.evaluation.statistics import summary
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import write, write_json
+from pipeline.files import write
 from pipeline.images.mp4 import mp4
 from pipeline.types import Frame
 
@@ -113,7 +113,7 @@ def _write_summary(evaluation: Evaluation, selection: Selection, rows: Sequence[
         "selection": selection.model_dump(mode="json"),
         "settings": one_setting([(row, evaluation.files) for row in rows]) or evaluation.settings.model_dump(),
     }
-    write_json(evaluation.folder / "summary.json", summarised)
+    outputs.write_json(evaluation.folder / "summary.json", summarised)
     # Other calls have written results of other tasks; equal settings are those of this call's results. A call without
     # any result does not know them, and leaves a table of the policy as it is.
     of_policy = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]

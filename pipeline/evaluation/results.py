@@ -10,9 +10,10 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from pipeline import outputs
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
-from pipeline.files import is_temporary, read_json, reject_other_file, write
+from pipeline.files import is_temporary, read_json, write
 from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
@@ -126,7 +127,7 @@ class EpisodeFiles:
         writer = csv.writer(lines, lineterminator="\n")
         writer.writerow(TABLE)
         writer.writerows([getattr(row, column) for column in TABLE] for row in rows)
-        write(self.table, lines.getvalue())
+        outputs.write(self.table, lines.getvalue())
 
     def reject_other_folder(self) -> None:
         """Reject a folder with files but without results, such as a checkpoint's, and another program's summary.
@@ -134,13 +135,13 @@ class EpisodeFiles:
         Raises:
             PipelineError: if the folder is rejected; it names the folder or the file.
         """
-        reject_other_file(self.folder / "summary.json", '"by_axis": ')
-        reject_other_file(self.table, ",".join(TABLE))
+        outputs.reject_other_file(self.folder / "summary.json")
+        outputs.reject_other_file(self.table)
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
         # An evaluation without results writes its summary, and may be killed after the video of its first episode.
         names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
-        if set(names) - {"summary.json", self.table.name, "videos"}:
+        if set(names) - {"summary.json", self.table.name, "videos", outputs.RECORD}:
             raise PipelineError(
                 f"the folder has files but no results of an evaluation: {', '.join(sorted(names)[:3])}",
                 where=self.folder,

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pipeline.errors import PipelineError
 from pipeline.evaluation.held_out import digest_first_perturbations
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import reject_other_file, write
+from pipeline.outputs import write
 from pipeline.seeding import digest
 
 
@@ -61,15 +61,6 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
             remedy="generate the list again with the same command, or evaluate with the version that generated it",
         )
     return listed.tasks
-
-
-def reject_other_list(file: Path) -> None:
-    """Reject a file that ``write_tasks`` would overwrite but has not written.
-
-    Raises:
-        PipelineError: if the file is rejected; it names the file.
-    """
-    reject_other_file(file, '"draws": "')
 
 
 def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:

@@ -5,7 +5,7 @@ from itertools import chain, cycle
 from pathlib import Path
 from typing import Any
 
-from pipeline import files
+from pipeline import outputs
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
@@ -50,12 +50,12 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
     if path.suffix != ".html":
         raise PipelineError("the report is an HTML page", where=path, expected="a name that ends in .html")
     json_path = path.with_suffix(".json")
-    files.reject_other_file(path, "<title>Evaluation: ")
-    files.reject_other_file(json_path, '"paper_table": ')
+    outputs.reject_other_file(path)
+    outputs.reject_other_file(json_path)
     found = findings(policies)
     videos = dict(chain.from_iterable(policy.videos.items() for policy in policies))
-    files.write(path, page(found, videos))
-    files.write_json(json_path, found)
+    outputs.write(path, page(found, videos))
+    outputs.write_json(json_path, found)
     rates = {}
     for name, policy in found["policies"].items():
         rates[name] = {source: summary["all"] for source, summary in policy["results"].items()}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import PipelineError
-from pipeline.files import reject_other_file, write
+from pipeline.outputs import reject_other_file, write
 from pipeline.report.paper_table import DIMENSIONS
 
 HEADINGS = (*DIMENSIONS, "total", "mean of seven")
@@ -19,12 +19,8 @@ SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal":
 
 NOT_STATED = "not stated"
 
-MARKS = {
-    ".md": f"| model | {' | '.join(HEADINGS)} |",
-    ".csv": "model,published,program,prompt,step_limits",
-    ".tex": f"% model & {' & '.join(HEADINGS)} \\\\",
-}
-"""Suffix of each file to a text that all these files contain."""
+SUFFIXES = (".md", ".csv", ".tex")
+"""Suffixes of the files of a table."""
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -167,7 +163,7 @@ def _limits(limits: Mapping[str, Sequence[int]]) -> str:
 
 def markdown(table: Mapping[str, Any]) -> str:
     """Return the table as Markdown, with the protocol of each evaluated policy and the left-out parts."""
-    lines = [MARKS[".md"], f"|---|{'---:|' * len(HEADINGS)}"]
+    lines = [f"| model | {' | '.join(HEADINGS)} |", f"|---|{'---:|' * len(HEADINGS)}"]
     rows = rows_of(table)
     sizes = {**table["tasks"], "total": sum(table["tasks"].values())}
     for row in rows:
@@ -249,7 +245,11 @@ def csv_text(table: Mapping[str, Any]) -> str:
     counted = (*DIMENSIONS, "total")
     writer.writerow(
         [
-            *MARKS[".csv"].split(","),
+            "model",
+            "published",
+            "program",
+            "prompt",
+            "step_limits",
             "trials_per_task",
             "episodes_left_out",
             "black_views",
@@ -286,7 +286,7 @@ def csv_text(table: Mapping[str, Any]) -> str:
 
 def latex(table: Mapping[str, Any]) -> str:
     """Return a LaTeX row of each evaluated policy, for a ``tabular`` with ten columns; comments state the protocol."""
-    lines = [MARKS[".tex"]]
+    lines = [f"% model & {' & '.join(HEADINGS)} \\\\"]
     for row in rows_of(table):
         if row.published:
             continue
@@ -335,5 +335,5 @@ def reject_other_tables(path: Path) -> None:
     """
     if path.name in ("", ".."):
         raise PipelineError("the path has no name for the files", where=path, expected="a name such as tables/mine")
-    for suffix, mark in MARKS.items():
-        reject_other_file(path.with_name(path.name + suffix), mark)
+    for suffix in SUFFIXES:
+        reject_other_file(path.with_name(path.name + suffix))

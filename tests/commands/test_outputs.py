@@ -78,10 +78,51 @@ def test_a_file_of_another_kind_is_named_and_stays(
     assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before
 
 
+WRITES = {
+    "report.html": ("analyze", "report", "results"),
+    "report.json": ("analyze", "report", "results"),
+    "results/gap.json": ("analyze", "gap", "results"),
+    "results/gap.png": ("analyze", "gap", "results"),
+    "tasks.json": ("analyze", "grade", "results", "--out", "tasks.json"),
+}
+"""File to the command that writes it."""
+
+
 def test_what_a_command_wrote_it_overwrites(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(results.parent)
     for _ in range(2):
-        assert called(monkeypatch, "analyze", "report", "results") == 0
-        assert called(monkeypatch, "analyze", "gap", "results") == 0
-        assert called(monkeypatch, "analyze", "grade", "results", "--out", "tasks.json") == 0
+        for words in dict.fromkeys(WRITES.values()):
+            assert called(monkeypatch, *words) == 0
     assert json.loads(Path("tasks.json").read_text())["tasks"]
+
+
+@pytest.mark.parametrize("name", WRITES)
+def test_an_edit_of_such_a_file_is_named_and_stays(
+    name: str, results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also as part of a document of the user, in which all of the command's text still is."""
+    monkeypatch.chdir(results.parent)
+    assert called(monkeypatch, *WRITES[name]) == 0
+    edited = b"My own notes.\n" + Path(name).read_bytes()
+    Path(name).write_bytes(edited)
+    assert called(monkeypatch, *WRITES[name]) == 1
+    assert f"{Path(name).name}: the command would overwrite the file" in capsys.readouterr().err
+    assert Path(name).read_bytes() == edited
+
+
+def test_a_copy_in_another_folder_is_a_file_of_the_user(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(results.parent)
+    assert called(monkeypatch, "analyze", "report", "results") == 0
+    copy = Path("kept/report.html")
+    copy.parent.mkdir()
+    copy.write_bytes(Path("report.html").read_bytes())
+    assert called(monkeypatch, "analyze", "report", "results", "--out", str(copy)) == 1
+
+
+def test_a_link_is_not_replaced_by_a_file(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(results.parent)
+    assert called(monkeypatch, "analyze", "report", "results") == 0
+    Path("report.html").rename("elsewhere.html")
+    Path("report.html").symlink_to("elsewhere.html")
+    assert called(monkeypatch, "analyze", "report", "results") == 1
+    assert Path("report.html").is_symlink()

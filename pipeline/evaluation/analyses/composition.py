@@ -39,11 +39,8 @@ from pipeline.evaluation.results import (
     reject_repeated_tasks,
 )
 from pipeline.evaluation.statistics import Interval, interval
-from pipeline.files import replaced
+from pipeline.outputs import written
 from pipeline.types import Floats
-
-TITLE = "perturbed-demos: compositional gap"
-"""Title in the metadata of a heat map; `analyze gap` recognises its own files by this title."""
 
 
 @dataclass(frozen=True)
@@ -245,5 +242,5 @@ def heatmap(measured: Sequence[AxisPair], file: Path) -> None:
     axes.set_yticks(range(len(names)), names)
     axes.set_title("above: p(i | success) p(j | success)\nbelow: p(i, j | success)", fontsize=10)
     figure.colorbar(image, ax=axes)
-    with replaced(file) as temporary:
-        figure.savefig(temporary, format="png", dpi=120, metadata={"Title": TITLE})
+    with written(file) as temporary:
+        figure.savefig(temporary, format="png", dpi=120)

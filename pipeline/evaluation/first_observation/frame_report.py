@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.errors import PipelineError
 from pipeline.evaluation.first_observation.frame_search import CLEAR, FEWEST_PX, Found, Match, middle, search
 from pipeline.evaluation.first_observation.picture_fit import (
     FITTING,
@@ -27,9 +26,9 @@ from pipeline.evaluation.first_observation.picture_fit import (
 )
 from pipeline.evaluation.first_observation.picture_points import place
 from pipeline.evaluation.first_observation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
-from pipeline.files import replaced
 from pipeline.images.jpeg import encode_exactly, resized
 from pipeline.libero.starts import SETTLING_STEPS
+from pipeline.outputs import written
 from pipeline.rendering.geometry import COMMON, FLOOR, GRIPPER, NOTHING, ROBOT, ROOM, TABLE, WALL
 from pipeline.rendering.srgb import FIRST_VERSION
 from pipeline.types import Frame, Task
@@ -160,30 +159,19 @@ def compare_frame(
     return Report(_raw_difference(picture, found.expected), findings, found)
 
 
-def reject_existing(file: Path) -> None:
-    """Reject a file that exists, which ``write_sheet`` would replace.
-
-    Raises:
-        PipelineError: if the file exists.
-    """
-    if file.exists():
-        raise PipelineError("the file exists", where=file, expected="a new file", remedy="name another file")
-
-
 def write_sheet(report: Report, file: Path) -> None:
     """Write the picture, our frame and their difference side by side as a PNG file.
 
     The picture is undone as the report states; the difference is four times as bright.
 
     Raises:
-        PipelineError: if the file exists.
+        PipelineError: if a file would be overwritten that no command wrote.
     """
-    reject_existing(file)
     match = report.found.match
     picture = resized(match.variant.pixels, SIZE_PX, SIZE_PX)
     apart = np.abs(picture.astype(np.int16) - match.frame.astype(np.int16))
     panels = [picture, match.frame, np.minimum(4 * apart, 255).astype(np.uint8)]
-    with replaced(file) as unfinished:
+    with written(file) as unfinished:
         unfinished.write_bytes(encode_exactly(np.hstack(panels)[..., ::-1]))
 
 
