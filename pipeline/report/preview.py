@@ -31,6 +31,7 @@ from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
 from pipeline.rendering.renderer import LastScene, scene_of_process
 from pipeline.report.sheets import Tile, describe, describe_all, lettering, sheet, side_by_side
+from pipeline.run.foreign import reject_foreign_files
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task, Trajectory
@@ -318,6 +319,9 @@ def for_run(config: Config, folder: Path, workers: Workers) -> None:
     """Write a sheet for every configured axis that applies, on the first task of each suite of the run.
 
     The path of a sheet is ``<folder>/<suite>/<axis>.png``.
+
+    Raises:
+        PipelineError: if the folder has files that no stage generated; they stay.
     """
     by_suite = grouped((task.suite, task) for task in select_tasks(config.demos.tasks))
     test = benchmark.load()
@@ -327,6 +331,7 @@ def for_run(config: Config, folder: Path, workers: Workers) -> None:
             workers(_render_all, jobs, "previews")
         finally:
             scene_of_process().close()
+        reject_foreign_files(folder.parent, [folder.name])  # Stored since the stage began.
 
 
 def _render_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:

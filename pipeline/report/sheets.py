@@ -14,6 +14,7 @@ from pipeline.axes.base import Layer, Perturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.run.counts import by_axis, twins
+from pipeline.run.foreign import reject_foreign_files
 from pipeline.types import Episode, Frame, Task
 
 Font = ImageFont.ImageFont | ImageFont.FreeTypeFont
@@ -57,6 +58,9 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
 
     Args:
         folder: folder of the pictures, one ``<axis>.png`` for each axis with a kept episode whose clean twin is stored.
+
+    Raises:
+        PipelineError: if the folder has files that no stage generated; they stay.
     """
     twin_ids = twins(manifest).keys()
     perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed" and row["twin_id"] in twin_ids]
@@ -65,6 +69,7 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
         for axis, rows in by_axis(perturbed).items():
             tiles = [_pair(row, load) for row in spread(rows, 4 * COLUMNS)]
             sheet(f"{axis}; {HEADER}", tiles).save(temporary / f"{axis}.png")
+        reject_foreign_files(folder.parent, [folder.name])  # Stored since the stage began.
 
 
 def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:

@@ -9,16 +9,15 @@ from pipeline.axes import AXES
 from pipeline.errors import PipelineError
 from pipeline.files import is_temporary
 from pipeline.run.layout import FRAMES, PREVIEWS, SHEETS, TRAJECTORIES
-from pipeline.stores.store import EARLIER_SUFFIX, SUFFIX, TABLE
+from pipeline.stores.store import EARLIER_SUFFIX, ID, SUFFIX, TABLE
 
 _AXIS = rf"({'|'.join(AXES)})"
 _SHEET = rf"{_AXIS}(\+{_AXIS})*\.png"
 _STORED = rf"({re.escape(SUFFIX)}|{re.escape(EARLIER_SUFFIX)})"
-_ID = "[0-9a-f]{16}"
 
 CLEARED = {
-    TRAJECTORIES: rf"{re.escape(TABLE)}|{_ID}{_STORED}",
-    FRAMES: rf"{re.escape(TABLE)}|{_ID}/{_ID}{_STORED}",
+    TRAJECTORIES: rf"{re.escape(TABLE)}|{ID}{_STORED}",
+    FRAMES: rf"{re.escape(TABLE)}|{ID}/{ID}{_STORED}",
     SHEETS: _SHEET,
     PREVIEWS: rf"[a-z0-9_]+/{_AXIS}\.png",
 }

@@ -11,6 +11,7 @@ table describes the fingerprints in words: recipes, packages and settings.
 """
 
 import json
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -32,6 +33,11 @@ from pipeline.stores.sealed_file import BrokenSealError, SealedFile, seal, unsea
 from pipeline.tables import read_table, write_table
 
 TABLE = "index.parquet"
+
+ID = "[0-9a-f]{16}"
+"""Pattern of the ids in the names of files."""
+
+_NAME = re.compile(rf"{ID}(/{ID})?")
 
 SUFFIX = ".npz"
 
@@ -96,13 +102,16 @@ class Store(ABC):
 
     def names(self) -> list[str]:
         """List all files, up to date or not."""
-        return sorted(path.relative_to(self.root).with_suffix("").as_posix() for path in self.root.glob(self.pattern))
+        return self._names(self.pattern)
 
     def names_of_all_versions(self) -> list[str]:
         """List all files, also files that this version does not read."""
-        earlier = self.root.glob(self.pattern.replace(SUFFIX, EARLIER_SUFFIX))
-        earlier_names = {path.relative_to(self.root).with_suffix("").as_posix() for path in earlier}
-        return sorted({*self.names(), *earlier_names})
+        return sorted({*self.names(), *self._names(self.pattern.replace(SUFFIX, EARLIER_SUFFIX))})
+
+    def _names(self, pattern: str) -> list[str]:
+        """List the names of the files that match a glob pattern; files whose names are no ids are the user's."""
+        names = (path.relative_to(self.root).with_suffix("").as_posix() for path in self.root.glob(pattern))
+        return sorted(name for name in names if _NAME.fullmatch(name))
 
     def write(self, name: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
         """Write a file of arrays, with ``attributes`` as JSON; it is complete or absent."""
@@ -251,12 +260,16 @@ class Store(ABC):
         return rows
 
     def keep(self, names: Iterable[str]) -> None:
-        """Delete every other file of the store and the leftovers of killed workers; write the table again."""
+        """Delete every other file of the store and the leftovers of killed workers; write the table again.
 
-        def made(file: Path) -> bool:
-            return file.suffix in (SUFFIX, EARLIER_SUFFIX)
+        Files whose names are no ids stay: the user may have stored them.
+        """
 
-        keep_below(self.root, {self.root / TABLE, *map(self.path, names)}, made)
+        def is_of_store(file: Path) -> bool:
+            name = file.relative_to(self.root).with_suffix("").as_posix()
+            return file.suffix in (SUFFIX, EARLIER_SUFFIX) and _NAME.fullmatch(name) is not None
+
+        keep_below(self.root, {self.root / TABLE, *map(self.path, names)}, is_of_store)
         rows = self.refresh()
         if self._records().keys() - {self.made_by} and len(rows) == len(self.names()):
             self._write(rows, {self.made_by: Record(self.basis)})

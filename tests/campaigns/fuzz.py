@@ -199,7 +199,7 @@ def _trajectory() -> bytes:
         store = TrajectoryStore(folder)
         store.save(
             Trajectory(
-                "trajectory",
+                "0" * 16,
                 "open_loop",
                 Scene("<mujoco/>", states[0]),
                 states,
@@ -208,7 +208,7 @@ def _trajectory() -> bytes:
                 Verdict(True, "kept"),
             )
         )
-        return store.path("trajectory")
+        return store.path("0" * 16)
 
     return _in_temporary(write)
 
@@ -227,7 +227,7 @@ def _frames() -> bytes:
             "two": [Jpeg(bytes([n]) * 90) for n in range(20)],
         }
         store.save(
-            "frames", Rendered("open_loop", state, joints, action, action, streams, {"three": "too_dark"}), "llvmpipe"
+            "0" * 16, Rendered("open_loop", state, joints, action, action, streams, {"three": "too_dark"}), "llvmpipe"
         )
         (name,) = store.names()
         return store.path(name)

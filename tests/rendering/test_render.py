@@ -183,7 +183,7 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     assert rendered.rejected == {streams[1].stream_id: "too_dark"}
     assert set(rendered.streams) == {streams[0].stream_id, streams[2].stream_id}
     store = FrameStore(tmp_path, RenderConfig())
-    store.save("t", rendered, "some device")
+    store.save("0" * 16, rendered, "some device")
     (row,) = store.rows().values()
     assert {*row["streams"], *json.loads(row["rejected"])} == {stream.stream_id for stream in streams}
     assert json.loads(row["rejected"]) == rendered.rejected

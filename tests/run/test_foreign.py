@@ -5,13 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic import episodes, write_lerobot, write_lerobot_v21, write_rlds
+from synthetic import episode, episodes, write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.formats.rlds import Rlds
+from pipeline.report import sheets
 from pipeline.run.export import _bring_up_to_date
 from pipeline.run.run import Run
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 
 PLAN = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
 RUN = Run(Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}}))
@@ -60,4 +63,28 @@ def test_a_file_inside_a_set_is_rejected_and_stays(content: str, write: Any, tmp
     theirs.write_text("mine")
     with pytest.raises(PipelineError, match=r"README\.md: the entry is not of this run's"):
         _bring_up_to_date(target, episodes(content=content), RUN)
+    assert theirs.read_text() == "mine"
+
+
+@pytest.mark.parametrize("theirs", ["mine.npz", "notes/mine.npz", "0123456789abcdef/mine.npz", "mine.txt"])
+@pytest.mark.parametrize("store", [TrajectoryStore, FrameStore])
+def test_a_file_that_is_stored_among_replays_or_frames_during_a_stage_stays(
+    theirs: str, store: type[TrajectoryStore | FrameStore], tmp_path: Path
+) -> None:
+    """As a stage ends, it deletes what a changed plan no longer needs. It looked for foreign files as it began."""
+    file, unneeded = tmp_path / theirs, tmp_path / "0123456789abcdef.npz"
+    file.parent.mkdir(exist_ok=True)
+    for path in (file, unneeded):
+        path.write_bytes(b"mine")
+    (TrajectoryStore(tmp_path) if store is TrajectoryStore else FrameStore(tmp_path, RUN.config.render)).keep([])
+    assert file.read_bytes() == b"mine"
+    assert not unneeded.exists()
+
+
+def test_a_file_that_is_stored_among_sheets_during_the_stage_stays(tmp_path: Path) -> None:
+    theirs = tmp_path / "sheets" / "notes.txt"
+    theirs.parent.mkdir()
+    theirs.write_text("mine")
+    with pytest.raises(PipelineError, match=r"sheets/notes\.txt"):
+        sheets.write([], lambda name: episode(name), theirs.parent)
     assert theirs.read_text() == "mine"

@@ -301,7 +301,7 @@ def test_hdf5_files_of_an_earlier_version_are_not_replaced_unasked(rows: list[pl
     run = run_in(trajectories.parent)
     file = next(trajectories.glob("*.npz"))
     file.rename(file.with_suffix(".h5"))
-    frames = trajectories.parent / "frames" / file.stem / "0123.h5"
+    frames = trajectories.parent / "frames" / file.stem / "0123456789abcdef.h5"
     frames.parent.mkdir(parents=True)
     frames.write_bytes(b"frames of an earlier version")
     earlier = {"the HDF5 container of an earlier version": 1}
