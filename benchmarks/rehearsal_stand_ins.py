@@ -28,7 +28,7 @@ from pipeline.physics.controller_goals import absolute_actions
 from pipeline.planning.streams import Stream
 from pipeline.scenes.compiled import GripPose
 from pipeline.types import Demo, Frame, Geometry, Jpeg, Rendered, Scene, Task, Trajectory, Verdict
-from pipeline.validation.checks import ARM, GRIP_IN_HAND
+from pipeline.validation.checks.motion import ARM, GRIP_IN_HAND
 
 STEPS = 8
 """Shortest episode that OpenVLA-OFT can read: one of its chunks."""

@@ -5,6 +5,9 @@ from functools import partial
 MAKE_AGAIN = "python -m pipeline run CONFIG"
 """Remedy where an output of a run is missing or damaged. `dvc repro` would run the configuration in params.yaml."""
 
+RUN_AGAIN = f"run `{MAKE_AGAIN}`"
+"""``MAKE_AGAIN`` as part of a sentence."""
+
 
 class PipelineError(Exception):
     """Error that states the fault, its place, the expected value and a remedy.

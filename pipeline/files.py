@@ -13,7 +13,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.errors import RUN_AGAIN, PipelineError
 
 
 def schema_file(name: str) -> Path:
@@ -58,7 +58,7 @@ def checksum_of(version: Edition) -> str:
     return checksum(version.path)
 
 
-def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
+def read_json(file: Path, remedy: str = RUN_AGAIN) -> dict[str, Any]:
     """Read a JSON object that a stage wrote.
 
     Raises:

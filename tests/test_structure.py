@@ -86,7 +86,7 @@ AXIS_IS_SUBJECT = {
     "pipeline.libero.demonstrations",
     # Other things with the name of an axis: columns and types of lerobot, keys of vla-eval, the instance of the arm.
     *("pipeline.formats.lerobot", "pipeline.formats.lerobot.columns", "pipeline.formats.lerobot.write_shared"),
-    *("pipeline.formats.lerobot.language", "pipeline.validation.checks"),
+    *("pipeline.formats.lerobot.language", "pipeline.validation.checks.labels"),
     *("pipeline.evaluation.harness", "pipeline.rendering.geometry"),
     *("pipeline.rewriting.rewrite", "pipeline.report.paper_rows"),
 }

@@ -24,7 +24,7 @@ from pipeline.axes.light import LightAxis
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
-from pipeline.errors import PipelineError
+from pipeline.errors import RUN_AGAIN, PipelineError
 from pipeline.libero.tasks import find_task
 from pipeline.testset.benchmark import TestTask
 from pipeline.types import Frozen, Task
@@ -156,7 +156,8 @@ def from_json(text: str) -> tuple[Perturbation, ...]:
         raise PipelineError(
             f"not perturbations of this version: {'.'.join(map(str, fault['loc'][1:])) or 'the list'}: {fault['msg']}",
             where=f"perturbations {text:.80}",
-            remedy="run the plan stage again, or read the file with the version that wrote it",
+            expected="perturbations that this version samples",
+            remedy=f"{RUN_AGAIN}, which plans again; or read the file with the version that wrote it",
         ) from error
 
 

@@ -396,7 +396,9 @@ def arena(problem: str) -> Arena:
     if match is None:
         raise PipelineError(
             f"the scene class {problem!r} names no known arena",
+            where="(define (problem ...)) of a BDDL file",
             expected=f"libero_<arena>_[tabletop_]manipulation, <arena> being one of {', '.join(get_args(Arena))}",
+            remedy="name one of LIBERO's scene classes, see docs/own-tasks.md",
         )
     return cast(Arena, match[1])
 

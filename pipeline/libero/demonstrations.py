@@ -130,13 +130,21 @@ class StarterSource:
         """Load one demonstration, by its id."""
         demo = self.demonstration(_parse(demo_id)[0])
         if demo.demo_id != demo_id:
-            raise PipelineError(f"the starter set has no {demo_id}", expected=demo.demo_id)
+            raise PipelineError(
+                f"the starter set has no {demo_id}",
+                expected=demo.demo_id,
+                remedy="use this id, or set demos.root to a folder that has the demonstration",
+            )
         return demo
 
     def demonstration(self, task: Task) -> Demo:
         """Load the task's only demonstration."""
         if task.suite not in SUITES:
-            raise PipelineError(f"the starter set has no demonstration of {task}", expected="a LIBERO task")
+            raise PipelineError(
+                f"the starter set has no demonstration of {task}",
+                expected="a LIBERO task",
+                remedy="set demos.root to a folder with demonstrations of the task",
+            )
         group = "libero-90" if task.suite == "libero_90" else "libero"
         name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
         folder = package_folder("robouse") / "bundled_tasks" / group / name
@@ -499,5 +507,9 @@ def _parse(demo_id: str) -> tuple[Task, str]:
     """Split a demonstration's id into its task and its key."""
     parts = demo_id.split("/")
     if len(parts) != 3:
-        raise PipelineError(f"not a demonstration's id: {demo_id!r}", expected="<suite>/<task>/<key>")
+        raise PipelineError(
+            f"not a demonstration's id: {demo_id!r}",
+            expected="<suite>/<task>/<key>",
+            remedy="take the id from the column demo_id of a manifest",
+        )
     return find_task(parts[0], parts[1]), parts[2]

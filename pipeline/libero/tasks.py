@@ -170,7 +170,11 @@ def find_task(suite: str, name: str) -> Task:
     by_name = {task.name: task for task in tasks(suite)}
     if name not in by_name:
         closest = difflib.get_close_matches(name, by_name, cutoff=0)
-        raise PipelineError(f"{suite} has no task {name!r}", expected=" or ".join(closest))
+        raise PipelineError(
+            f"{suite} has no task {name!r}",
+            expected=" or ".join(closest),
+            remedy=f"list the tasks by `python -m pipeline tasks '{suite}/*'`",
+        )
     return by_name[name]
 
 
@@ -208,6 +212,10 @@ def select_tasks(patterns: Iterable[str]) -> list[Task]:
         matched = fnmatch.filter(by_name, pattern)
         if not matched:
             closest = difflib.get_close_matches(pattern, by_name, cutoff=0)
-            raise PipelineError(f"no task matches {pattern!r}", expected="a pattern such as " + " or ".join(closest))
+            raise PipelineError(
+                f"no task matches {pattern!r}",
+                expected="a pattern such as " + " or ".join(closest),
+                remedy="list all tasks by `python -m pipeline tasks`",
+            )
         chosen.update(matched)
     return [task for name, task in by_name.items() if name in chosen]

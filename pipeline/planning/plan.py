@@ -22,7 +22,7 @@ from pipeline.axes import (
     to_json,
 )
 from pipeline.config import PlanConfig, ReplayConfig
-from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.errors import MAKE_AGAIN, RUN_AGAIN, PipelineError
 from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning.apportion import apportion
@@ -256,5 +256,5 @@ def read(path: Path) -> list[Row]:
         PipelineError: when the file is missing, damaged or not a plan of this version.
     """
     names = [column.name for column in fields(Row)]
-    columns = read_table(path, names, MAKE_AGAIN).select(names).to_pydict()
+    columns = read_table(path, names, RUN_AGAIN).select(names).to_pydict()
     return [Row(*row) for row in zip(*columns.values(), strict=True)]

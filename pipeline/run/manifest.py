@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.errors import MAKE_AGAIN, RUN_AGAIN, PipelineError
 from pipeline.export_config import Where
 from pipeline.identity import DISTRIBUTION, VERSIONS, version_column, versions
 from pipeline.libero.tasks import exceeds_step_limit
@@ -176,7 +176,7 @@ def read(path: Path) -> list[dict[str, Any]]:
     Raises:
         PipelineError: when the file is missing, damaged or not a manifest of this version.
     """
-    rows = list(read_table(path, schema().names, MAKE_AGAIN).to_pylist())
+    rows = list(read_table(path, schema().names, RUN_AGAIN).to_pylist())
     # Episodes of a task have equal rewrites, of 3 kB. One copy of each is kept.
     texts: dict[str, str] = {}
     for row in rows:

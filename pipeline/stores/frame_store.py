@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, SIZE_PX
-from pipeline.errors import PipelineError
+from pipeline.errors import RUN_AGAIN, PipelineError
 from pipeline.identity import MAPS_RECIPE, OTHER_SIZE_RECIPE
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
@@ -59,7 +59,7 @@ class FrameStore(Store):
     Frames that were encoded with another ``render_config`` count as missing. Further views are streams of their own.
     """
 
-    step, stage, pattern = "encoding", "render", f"*/*{SUFFIX}"
+    step, pattern = "encoding", f"*/*{SUFFIX}"
     columns: ClassVar = {
         "device": pa.string(),
         "replay_mode": pa.string(),
@@ -145,7 +145,7 @@ class FrameStore(Store):
             raise PipelineError(
                 f"the streams {sorted(frames | views)} are not rendered",
                 where=self.folder(trajectory_id),
-                remedy="run the render stage again",
+                remedy=f"{RUN_AGAIN}, which renders them",
             )
         return merged(parts)
 
@@ -197,7 +197,7 @@ class FrameStore(Store):
         raise PipelineError(
             "the trajectory has no rendered frames",
             where=self.folder(trajectory_id),
-            remedy="run the render stage again",
+            remedy=f"{RUN_AGAIN}, which renders them",
         )
 
     def _files_of(self, trajectory_id: str) -> list[str]:

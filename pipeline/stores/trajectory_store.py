@@ -26,8 +26,7 @@ class TrajectoryStore(Store):
     machine can read it.
     """
 
-    # The stage `render` generates missing trajectories too: it replays reserves.
-    step, stage = "physics", "render"
+    step = "physics"
     columns: ClassVar = {
         "kept": pa.bool_(),
         "reason": pa.string(),

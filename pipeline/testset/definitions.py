@@ -102,7 +102,12 @@ class Reader:
         """
         match = _NAME.fullmatch(name)
         if match is None or match["base"] not in self._bases[suite]:
-            raise PipelineError(f"the name of the test task {name!r} does not state its change", where=suite)
+            raise PipelineError(
+                f"the name of the test task {name!r} does not state its change",
+                where=suite,
+                expected="a task's name and a change, such as turn_on_the_stove_table_3",
+                remedy="name a test task of LIBERO-Plus",
+            )
         base = self._bases[suite][match["base"]]
         # Each task changes one thing; if a name lists several changes, the others have their neutral values.
         if match["noise"]:

@@ -134,3 +134,10 @@ def _levels(frames: Iterable[Frame]) -> NDArray[np.int64]:
     for frame in frames:
         counts += [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
     return counts
+
+
+def same_bits(first: NDArray[Any] | None, second: NDArray[Any] | None) -> bool:
+    """Compare two arrays bit for bit, with shape and type; `None` equals only `None`."""
+    if first is None or second is None:
+        return first is second
+    return (first.shape, first.dtype, first.tobytes()) == (second.shape, second.dtype, second.tobytes())

@@ -37,7 +37,7 @@ from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
 from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.validation.case import Case
-from pipeline.validation.checks import CHECKS, applies
+from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import compare_frames, compare_subtasks, witnesses
 
 WHOLE = 4
@@ -326,7 +326,7 @@ class EpisodesJob:
         witness = episode_id in sorted(self.witnesses)[:WHOLE]
         case = Case(row, made, trajectory, copies, language.bank if language else None, witness)
         for name, check in CHECKS.items():
-            results.note(name, check(case), int(applies(name, case)))
+            results.note(name, check.find(case), int(check.applies(case)))
         if episode_id in self.witnesses:
             results.note("rendered", compare_frames(case, self.run.config.render, scene_of_process()))
             results.note("subtasks", compare_subtasks(case))

@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline import generated
 from pipeline.compute.pool import Workers
-from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.errors import MAKE_AGAIN, RUN_AGAIN, PipelineError
 from pipeline.files import checksum, read_json
 from pipeline.formats.base import AnyFormat
 from pipeline.formats.read_back import Written
@@ -104,7 +104,7 @@ def _gone(store: Store, there: Sequence[str]) -> list[list[str]]:
     if not file.exists():
         return []
     try:
-        listed = {str(row["file"]) for row in read_table(file, ["file"], MAKE_AGAIN).to_pylist()}
+        listed = {str(row["file"]) for row in read_table(file, ["file"], RUN_AGAIN).to_pylist()}
     except PipelineError as error:
         return [[str(error)]]
     what = f"{file} lists it, but it is missing; `{MAKE_AGAIN}` generates it again"

@@ -29,9 +29,10 @@ from pipeline.report import figures
 from pipeline.report.sheets import Tile, sheet, side_by_side, spread
 from pipeline.seeding import digest
 from pipeline.types import Scene, Trajectory, Verdict
-from pipeline.validation import checks as of_episodes
 from pipeline.validation import rerender
 from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS, geometry, labels, motion, statistics
+from pipeline.validation.checks import pictures as picture_checks
 
 TEMPLATES = ("report.html.j2", "macros.html.j2", "style.css")
 
@@ -136,8 +137,10 @@ def checks() -> dict[str, Any]:
     )
     blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in decoded.items()})
     case = Case(row, made, trajectory, [whole, wrong, blank], None)
-    faults = {name: len(list(check(case))) for name, check in of_episodes.CHECKS.items()}
-    limits = {name: value for name, value in vars(of_episodes).items() if isinstance(value, float)}
+    faults = {name: len(list(check.find(case))) for name, check in CHECKS.items()}
+    limits: dict[str, float] = {}
+    for module in (geometry, labels, motion, picture_checks, statistics):
+        limits |= {name: value for name, value in vars(module).items() if isinstance(value, float)}
     limits |= {"fresh PSNR dB": rerender.PSNR_DB, "mean levels": MEAN_LEVELS, "deviation": DEVIATION}
     return {"found": faults, "limits": limits}
 

@@ -26,7 +26,7 @@ from pipeline.formats.read_back import Copy
 from pipeline.run.export import export
 from pipeline.types import Episode
 from pipeline.validation.case import Case
-from pipeline.validation.checks import CHECKS, applies
+from pipeline.validation.checks import CHECKS
 
 LEROBOT = Version(version("lerobot"))
 
@@ -146,8 +146,8 @@ def copied(dataset: LeRobot, episode_id: str) -> Copy:
 def findings(check: str, made: Episode, copy: Copy, witness: bool = True) -> list[str]:
     no_replay: Any = None
     case = Case({"instruction": made.instruction}, made, no_replay, [copy], None, witness)
-    assert applies(check, case)
-    return [fault.what for fault in CHECKS[check](case)]
+    assert CHECKS[check].applies(case)
+    return [fault.what for fault in CHECKS[check].find(case)]
 
 
 @pytest.mark.parametrize("episode_id", IDS)

@@ -265,9 +265,9 @@ def faults(target: Hdf5, source: Callable[[str], Episode] = episode) -> Mapping[
     motion = (states, replay.actions, np.zeros((len(states), 0), np.float32), Verdict(True, "kept"))
     case = Case(rows[IDS[0]], made, Trajectory("", "open_loop", replay.scene, *motion), [copy], None)
     for name in ("length", "instruction", "provenance", "jpeg", "geometry", "flags"):
-        found.setdefault(name, []).extend(fault.what for fault in CHECKS[name](case))
+        found.setdefault(name, []).extend(fault.what for fault in CHECKS[name].find(case))
     # The synthetic actions are not those of the synthetic states.
-    of_copy = [fault.what for fault in CHECKS["motion"](case) if fault.dataset == "hdf5"]
+    of_copy = [fault.what for fault in CHECKS["motion"].find(case) if fault.dataset == "hdf5"]
     found.setdefault("motion", []).extend(of_copy)
     return {name: texts for name, texts in found.items() if texts}
 

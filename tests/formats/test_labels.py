@@ -59,7 +59,7 @@ def found_in(row: dict[str, Any], changed: Episode) -> list[tuple[str, str]]:
     made = episode(IDS[1])
     copy = Copy("rlds", changed, [made.instruction] * len(made), {}, {}, {})
     no_replay: Any = None
-    faults: list[Fault] = [*CHECKS["labels"](Case({**in_manifest(made), **row}, made, no_replay, [copy], None))]
+    faults: list[Fault] = [*CHECKS["labels"].find(Case({**in_manifest(made), **row}, made, no_replay, [copy], None))]
     return [(fault.dataset, fault.what) for fault in faults]
 
 

@@ -221,7 +221,7 @@ def test_what_validate_does_not_expect_in_it_is_found(
     copy = read.read(tmp_path / NAME, made.episode_id, Layout(STANDARD, CONVENTIONS["libero"], "video"))
     assert copy is not None
     no_replay: Any = None
-    found = CHECKS["instruction"](Case({"instruction": made.instruction}, made, no_replay, [copy], None))
+    found = CHECKS["instruction"].find(Case({"instruction": made.instruction}, made, no_replay, [copy], None))
     name = "language events" if column == EVENTS else "language column"
     expected = [] if at is None else [f"{name} of step {at % len(made)}"]
     assert [fault.what.split(" has ")[0] for fault in found] == expected

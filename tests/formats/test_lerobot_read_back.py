@@ -54,7 +54,7 @@ def test_every_image_file_is_read_back(version: str, tmp_path: Path) -> None:
     put(max(target.folder.glob("*/data/**/*.parquet")), target.keys["wrist_image"], other)
     copy = target.read(source.provenance)
     assert copy is not None
-    (fault,) = CHECKS["jpeg"](Case({}, source, replay_of(source), [copy], None))
+    (fault,) = CHECKS["jpeg"].find(Case({}, source, replay_of(source), [copy], None))
     assert fault.what == f"wrist_image differs at 1 steps, first at {len(source) - 1}"
 
 
@@ -72,7 +72,7 @@ def of_first(target: LeRobot | LeRobotV21) -> list[Fault]:
     source = episode(IDS[0])
     copy = target.read(source.provenance)
     assert copy is not None
-    return list(CHECKS["statistics"](Case({}, source, replay_of(source), [copy], None)))
+    return list(CHECKS["statistics"].find(Case({}, source, replay_of(source), [copy], None)))
 
 
 @pytest.mark.parametrize("version", WITH_IMAGES)

@@ -292,7 +292,9 @@ def test_a_plan_of_another_version_is_named(test: TestSet) -> None:
         ("[{", "{", "Invalid JSON"),
     ):
         old = replace(noise, perturbations=noise.perturbations.replace(was, now))
-        with pytest.raises(PipelineError, match=f"not perturbations of this version: .*{fault}(?s:.*)plan stage again"):
+        with pytest.raises(
+            PipelineError, match=f"not perturbations of this version: .*{fault}(?s:.*)which plans again"
+        ):
             leakage.check([old], test)
 
 

@@ -41,7 +41,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
 from pipeline.validation.case import Case
-from pipeline.validation.checks import CHECKS, applies
+from pipeline.validation.checks import CHECKS
 
 EXTRAS: tuple[RenderedExtra, ...] = ("boxes", "depth", "object_poses", "segmentation")
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
@@ -279,9 +279,9 @@ def test_both_datasets_have_what_the_store_has(run: Path) -> None:
     assert len(names["layout"]) == len(names["clean"]) + 2
     for case in found:
         assert [copy.dataset for copy in case.copies] == ["rlds", "lerobot"]
-        assert list(CHECKS["geometry"](case)) == []
-        assert list(CHECKS["boxes"](case)) == []
-        assert applies("boxes", case)
+        assert list(CHECKS["geometry"].find(case)) == []
+        assert list(CHECKS["boxes"].find(case)) == []
+        assert CHECKS["boxes"].applies(case)
         last = pixels(case.made.geometry["image"].maps["segmentation"][-1])
         shown = {case.made.instances[place] for place in np.unique(last).tolist()}
         assert {"robot", "gripper", "table", "wall", "plate_1", "wooden_cabinet_1"} <= shown
@@ -320,7 +320,7 @@ def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:
         (replace(made, geometry={**made.geometry, "image": replace(seen, boxes=seen.boxes + 1)}), "image_boxes"),
         (replace(made, instances=made.instances[:-1]), "instances"),
     ):
-        findings = list(CHECKS["geometry"](replace(case, copies=[replace(copy, episode=spoilt)])))
+        findings = list(CHECKS["geometry"].find(replace(case, copies=[replace(copy, episode=spoilt)])))
         assert findings
         assert {finding.what.startswith(what) for finding in findings} == {True}
 
@@ -334,7 +334,7 @@ def test_a_box_that_is_not_around_its_mask_is_a_finding(view: str, run: Path) ->
     place = case.made.instances.index("gripper")
     shifted[0, place, 0] += 1
     spoilt = replace(case.made, geometry={**case.made.geometry, view: replace(seen, boxes=shifted)})
-    (finding,) = CHECKS["boxes"](replace(case, made=spoilt))
+    (finding,) = CHECKS["boxes"].find(replace(case, made=spoilt))
     assert finding.what.startswith(f"{view}_boxes of step 0 has ")
     assert finding.what.endswith(f"at place {place}")
 

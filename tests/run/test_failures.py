@@ -128,8 +128,8 @@ def test_another_mark_of_success_is_found(tmp_path: Path) -> None:
         replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), np.zeros(0), np.zeros(0), none, Verdict(False, ""))
         copy = target.read(row)
         assert copy is not None
-        assert list(CHECKS["flags"](Case(row, of_failure(IDS[0]), replay, [copy], None))) == []
-        (fault,) = CHECKS["flags"](Case(row | {"kept": True}, of_failure(IDS[0]), replay, [copy], None))
+        assert list(CHECKS["flags"].find(Case(row, of_failure(IDS[0]), replay, [copy], None))) == []
+        (fault,) = CHECKS["flags"].find(Case(row | {"kept": True}, of_failure(IDS[0]), replay, [copy], None))
         assert (fault.dataset, fault.what) == (target.name, "is_success of step 0 is 0")
 
 

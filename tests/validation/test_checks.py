@@ -51,7 +51,7 @@ def moved(entry: int) -> NDArray[np.float32]:
 
 def test_frames_of_another_motion_than_the_replays_are_found() -> None:
     whole = case()
-    assert list(CHECKS["motion"](whole)) == []
+    assert list(CHECKS["motion"].find(whole)) == []
     for spoilt, what in (
         (replace(MADE, action=np.roll(MADE.action, 1, axis=0)), "has other actions"),
         (replace(MADE, joint_state=np.roll(MADE.joint_state, 1, axis=0)), "has other joint angles"),
@@ -59,7 +59,7 @@ def test_frames_of_another_motion_than_the_replays_are_found() -> None:
         (replace(MADE, action_absolute=moved(4)), "action_absolute has other orientations"),
         (replace(MADE, action_absolute=moved(6)), "action_absolute has other gripper commands"),
     ):
-        (fault,) = CHECKS["motion"](replace(whole, made=spoilt))
+        (fault,) = CHECKS["motion"].find(replace(whole, made=spoilt))
         assert (fault.dataset, fault.what) == ("frames", what)
 
 
@@ -68,7 +68,7 @@ def test_a_rewrite_that_no_bank_has_is_found() -> None:
     strange = LanguagePerturbation(component="paraphrase", level=1, text="move the bowl over to the plate at last")
     for change, found in ((rewrite, []), (strange, [f"rewrite {strange.text!r} is not in the bank"])):
         row = {"suite": BOWL.suite, "task": BOWL.name, "perturbations": to_json([change]), "instruction": change.text}
-        assert [fault.what for fault in CHECKS["wording"](case(**row))] == found
+        assert [fault.what for fault in CHECKS["wording"].find(case(**row))] == found
 
 
 def test_results_that_do_not_follow_from_the_replay_are_found() -> None:
@@ -78,9 +78,9 @@ def test_results_that_do_not_follow_from_the_replay_are_found() -> None:
         "resolved": "{}",
         "exceeds_step_limit": False,
     }
-    assert list(CHECKS["results"](case(suite=BOWL.suite, **stated))) == []
+    assert list(CHECKS["results"].find(case(suite=BOWL.suite, **stated))) == []
     for column, other in (("actions_sha256", "0" * 64), ("resolved", '{"robot": 1}'), ("exceeds_step_limit", True)):
-        (fault,) = CHECKS["results"](case(suite=BOWL.suite, **{**stated, column: other}))
+        (fault,) = CHECKS["results"].find(case(suite=BOWL.suite, **{**stated, column: other}))
         assert (fault.dataset, fault.what) == ("manifest", f"{column} is {other!r}")
 
 

@@ -88,7 +88,7 @@ def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path,
     row = {**kept[IDS[0]], **labels, "rewrites": json.dumps(labels["rewrites"]), "kept": True}
     case = Case({**row, "instruction": source.instruction}, source, replay, [copy], None, witness)
     names = ("length", "motion", "instruction", "labels", "provenance", "place", "jpeg", "geometry", "flags", "clock")
-    faults = [fault for name in ("statistics", *names) for fault in CHECKS[name](case)]
+    faults = [fault for name in ("statistics", *names) for fault in CHECKS[name].find(case)]
     return [fault for fault in faults if fault.dataset == target.name]
 
 

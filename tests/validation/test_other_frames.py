@@ -33,7 +33,7 @@ def found(change: Callable[[dict[str, list[Any]]], dict[str, list[Any]]]) -> set
     copy = Copy("lerobot", replace(made, frames=change(STORED)), [], {}, {}, {})
     replay: Any = None  # None of these checks looks at it.
     case = Case({}, made, replay, [copy], None)
-    return {(name, fault.dataset) for name in LOOKED_AT for fault in CHECKS[name](case)}
+    return {(name, fault.dataset) for name in LOOKED_AT for fault in CHECKS[name].find(case)}
 
 
 def test_nothing_is_found_in_the_very_files() -> None:

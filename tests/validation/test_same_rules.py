@@ -18,7 +18,7 @@ from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Task
-from pipeline.validation import checks
+from pipeline.validation.checks import CHECKS
 from pipeline.validation.demonstrations import check
 
 BOWL = find_task("libero_goal", "put_the_bowl_on_the_plate")
@@ -71,7 +71,7 @@ def worded(task: Task, text: str, bank: Path | None = None) -> list[str]:
     rewrites = [one for one in list_rewrites(task, bank=bank) if one.text == text] if bank else []
     row = {"suite": task.suite, "task": task.name, "instruction": text, "perturbations": to_json(rewrites)}
     case: Any = SimpleNamespace(row=row, task=task, bank=bank, finding=lambda *told: told[1])
-    found: Any = checks.wording(case)
+    found: Any = CHECKS["wording"].find(case)
     return list(found)
 
 

@@ -237,7 +237,7 @@ def found_of_gripper(trajectory: Trajectory, sign: float = 1.0) -> list[str]:
     made = Episode(trajectory.trajectory_id, {}, state, joints, action, action, "", {}, {})
     commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
     copy = Copy("rlds", replace(made, action=commanded), [], {}, {}, {})
-    return [fault.what for fault in CHECKS["gripper"](Case({}, made, trajectory, [copy], None))]
+    return [fault.what for fault in CHECKS["gripper"].find(Case({}, made, trajectory, [copy], None))]
 
 
 def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory]) -> None:
