@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline import seeding
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json, task_of, to_json
-from pipeline.errors import PipelineError, RejectedError
+from pipeline.errors import MAKE_AGAIN, PipelineError, RejectedError
 from pipeline.evaluation import held_out_sight
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
@@ -239,7 +239,10 @@ def _edition(file: Path) -> Edition:
         return edition(file)
     except OSError as error:
         raise PipelineError(
-            f"the plan cannot be read ({error})", where=file, expected="data/<run>/plan.parquet"
+            f"the plan cannot be read ({error})",
+            where=file,
+            expected="data/<run>/plan.parquet",
+            remedy=f"run `{MAKE_AGAIN}`, which writes the plan",
         ) from error
 
 

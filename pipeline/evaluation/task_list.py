@@ -48,6 +48,7 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
             f"the file is not a list of tasks ({error})",
             where=file,
             expected="a file that `analyze construct` or `analyze grade` wrote",
+            remedy="write the list again by one of these commands",
         ) from error
     if listed.seed != seed:
         raise PipelineError(

@@ -102,7 +102,12 @@ class Reader:
         """
         match = _NAME.fullmatch(name)
         if match is None or match["base"] not in self._bases[suite]:
-            raise PipelineError(f"the name of the test task {name!r} does not state its change", where=suite)
+            raise PipelineError(
+                f"the name of the test task {name!r} does not state its change",
+                where=suite,
+                expected="a name such as turn_on_the_stove_view_0_0_100_2_352_initstate_0",
+                remedy="delete the folder data/testset: its wheel is fetched again",
+            )
         base = self._bases[suite][match["base"]]
         # Each task changes one thing; if a name lists several changes, the others have their neutral values.
         if match["noise"]:
