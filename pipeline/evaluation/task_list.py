@@ -20,7 +20,8 @@ class TaskList(BaseModel):
 
     Attributes:
         seed: seed of the tasks' perturbations.
-        draws: digest of all held-out perturbations; another version compares it to detect other perturbations.
+        draws: digest of all held-out perturbations; another version compares it to detect other perturbations. Stored
+            lists have this name, a former term for perturbations.
         tasks: the tasks; in the file, tasks may have more fields, such as ``difficulty``.
     """
 
