@@ -296,7 +296,10 @@ def content_of(checkpoint: Path) -> str:
     """
     if not (checkpoint / "config.json").is_file():
         raise PipelineError(
-            "the folder has no config.json", where=checkpoint, expected="a folder that lerobot saved a policy in"
+            "the folder has no config.json",
+            where=checkpoint,
+            expected="a folder that lerobot saved a policy in",
+            remedy="name the folder pretrained_model of a checkpoint",
         )
     checksums: dict[str, str] = {}
     for path in checkpoint.rglob("*"):

@@ -1,5 +1,6 @@
 """Complete evaluation: tasks run in worker processes, with one file per episode and a summary."""
 
+import platform
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -168,7 +169,10 @@ class EvaluationJob:
         if device != self.device:
             raise PipelineError(
                 f"this worker renders with {device}, the evaluation with {self.device}",
+                where=f"worker on {platform.node()}",
                 expected="one device for all frames, as devices differ by some grey levels",
+                remedy="start the evaluation and every worker on machines with the same OpenGL device (MUJOCO_GL "
+                "selects the back end)",
             )
         settings, archive = self.evaluation.settings, self.evaluation.archive
         environment = _open_environment(settings, archive)

@@ -124,6 +124,7 @@ class Evaluation:
             if contents:
                 versions["files of the benchmark"] = digest(contents)[:16]
         if task.source == "own":
+            # Stored results have this name, a former term for perturbations.
             versions["draws"] = held_out.digest_first_perturbations(task, self.settings.seed)
         base, demos = find_task(task.suite, task.base), self.settings.demos
         if task.suite not in SUITES:

@@ -127,7 +127,12 @@ def find_replacement(task: Task, name: str) -> Replacement:
     asked = name.rpartition("_")[0]
     if asked not in named:
         goals = " or ".join(named) or "a task with other objects"
-        raise PipelineError(f"{task.suite} has no goal {asked!r}", expected=goals)
+        raise PipelineError(
+            f"{task.suite} has no goal {asked!r}",
+            where=f"goals/{task.suite}/{name}",
+            expected=goals,
+            remedy="select the goals again with this version, or leave this task out",
+        )
     return named[asked]
 
 
@@ -219,7 +224,12 @@ def _find_words(suite: str, category: str) -> str:
                 match = pattern((thing_name,)).search(instruction)
                 if match:
                     return match[0]
-    raise PipelineError(f"LIBERO's instructions have no words for {category}", where="language_words.yaml")
+    raise PipelineError(
+        f"LIBERO's instructions have no words for {category}",
+        where=f"language_words.yaml, things.{category}.names",
+        expected="a name that an instruction of LIBERO has, in a scene with one thing of this category",
+        remedy="add this name",
+    )
 
 
 def _read_asked(task: Task, replacement: Replacement) -> Hashable:

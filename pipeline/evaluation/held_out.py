@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline import seeding
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json, task_of, to_json
-from pipeline.errors import PipelineError, RejectedError
+from pipeline.errors import MAKE_AGAIN, PipelineError, RejectedError
 from pipeline.evaluation import held_out_sight
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
@@ -46,6 +46,7 @@ def held_out_task(task: Task, axis: str, level: int, number: int, seed: int) -> 
     names = axes_of(axis)
     if not all(held_out_axis(name).applies(task) for name in names):
         return None
+    # Stored results have this name, so "draw", a former term for a held-out perturbation, stays.
     task_name = f"{task.name}_{axis}_level{level}_draw{number}"
     evaluation_task = EvaluationTask("own", task.suite, task.name, task_name, axis, "", level, number)
     components = [sample_perturbation(evaluation_task, seed, axis=name).component for name in names]
@@ -137,7 +138,7 @@ def _first_accepted(
         scene = _scene_with(perturbation, demo, nominal, opened)
         if scene is not None:
             return perturbation, scene
-    raise RejectedError(f"no_{axis}_draw_fits")
+    raise RejectedError(f"no_{axis}_perturbation_fits")
 
 
 def _scene_with(
@@ -239,7 +240,10 @@ def _edition(file: Path) -> Edition:
         return edition(file)
     except OSError as error:
         raise PipelineError(
-            f"the plan cannot be read ({error})", where=file, expected="data/<run>/plan.parquet"
+            f"the plan cannot be read ({error})",
+            where=file,
+            expected="data/<run>/plan.parquet",
+            remedy=f"run `{MAKE_AGAIN}`, which writes the plan",
         ) from error
 
 
@@ -266,6 +270,7 @@ def compare(
         distances = [(*planned_perturbations.nearest(perturbation, task), name) for name, perturbation, task in of_axis]
         smallest, episode, name = min(distances)
         compared = math.isfinite(smallest)
+        # Programs of users may read this output, so the key "draws" keeps the former term for perturbations.
         by_axis[axis] = {
             "draws": len(of_axis),
             "planned": planned_perturbations.counts[axis],

@@ -307,7 +307,12 @@ def _object_class(category: str, file: Path) -> Any:
                 return super()._get_object_subtree()
             body = self.worldbody.find("./body[@name='object']")
             if body is None:
-                raise PipelineError("the model has no body 'object'", where=file)
+                raise PipelineError(
+                    "the model has no body 'object'",
+                    where=file,
+                    expected="<body name='object'>, below <worldbody> or below a body of it",
+                    remedy="unpack the asset archive of LIBERO-Plus again",
+                )
             holder = ET.SubElement(self.worldbody, "body")
             holder.append(body)
             subtree = super()._get_object_subtree()

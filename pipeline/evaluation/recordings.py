@@ -108,6 +108,9 @@ def _entries_of(version: Edition, task: Task, root: Path) -> list[DemoEntry]:
             if problem.name == str(task) or problem.name.startswith(f"{task}/"):
                 raise problem.error
         raise PipelineError(
-            "the file has no demonstration", where=version.path, expected="at least one group data/demo_<number>"
+            "the file has no demonstration",
+            where=version.path,
+            expected="at least one group data/demo_<number>",
+            remedy="check the folder of --demos with `python -m pipeline demos check`",
         )
     return index.entries

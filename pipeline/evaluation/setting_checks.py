@@ -21,13 +21,24 @@ def check_policy_settings(policy: PolicyConfig, settings: EpisodeSettings) -> No
     """
     if settings.look_every != 1 and policy.kind != "server":
         raise PipelineError(
-            f"only a server can observe every {settings.look_every} steps", where="look_every", expected="--server"
+            f"only a server can observe every {settings.look_every} steps",
+            where="look_every",
+            expected="--server",
+            remedy="leave --look-every out",
         )
     if settings.state_angle != "server" and policy.kind != "server":
-        raise PipelineError("only a server has another range of angles", where="state_angle", expected="--server")
+        raise PipelineError(
+            "only a server has another range of angles",
+            where="state_angle",
+            expected="--server",
+            remedy="leave --state-angle out",
+        )
     if settings.actions == "absolute" and policy.kind in ("open_loop", "tracked"):
         raise PipelineError(
-            "the replays of demonstrations execute deltas", where="actions", expected="--server or --checkpoint"
+            "the replays of demonstrations execute deltas",
+            where="actions",
+            expected="--server or --checkpoint",
+            remedy="leave --actions out",
         )
 
 
@@ -45,6 +56,7 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
             f"task selection uses seed {selection.seed}, but perturbations use seed {settings.seed}",
             where="seed",
             expected="one seed for both",
+            remedy="leave the seed out of the settings",
         )
     if settings.plan is not None:
         held_out.sha256_of(settings.plan)
@@ -53,16 +65,21 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
                 "no task has held-out perturbations to compare with a plan",
                 where="plan",
                 expected="--source own or --source goals",
+                remedy="leave the plan out",
             )
     if settings.prompt == "benchmark" and not any(task.source == "libero_plus" for task in wanted):
         raise PipelineError(
-            "no task has an instruction of the benchmark", where="prompt", expected="--source libero_plus"
+            "no task has an instruction of the benchmark",
+            where="prompt",
+            expected="--source libero_plus",
+            remedy="leave --prompt out",
         )
     if settings.step_limits == "lerobot" and not any(task.suite == "libero_spatial" for task in wanted):
         raise PipelineError(
             "lerobot's step limits differ only in libero_spatial, and no task of this suite is selected",
             where="step_limits",
             expected="openvla",
+            remedy="leave --step-limits out",
         )
     if settings.initial_states == "demonstration":
         _check_demonstration_starts(wanted, settings)

@@ -20,7 +20,8 @@ class TaskList(BaseModel):
 
     Attributes:
         seed: seed of the tasks' perturbations.
-        draws: digest of all held-out perturbations; another version compares it to detect other perturbations.
+        draws: digest of all held-out perturbations; another version compares it to detect other perturbations. Stored
+            lists have this name, a former term for perturbations.
         tasks: the tasks; in the file, tasks may have more fields, such as ``difficulty``.
     """
 
@@ -48,6 +49,7 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
             f"the file is not a list of tasks ({error})",
             where=file,
             expected="a file that `analyze construct` or `analyze grade` wrote",
+            remedy="write the list again by one of these commands",
         ) from error
     if listed.seed != seed:
         raise PipelineError(

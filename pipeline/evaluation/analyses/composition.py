@@ -157,6 +157,7 @@ def pairs(results: Iterable[Stored]) -> list[AxisPair]:
     if not counted:
         raise PipelineError(
             "no trial has all four combinations of two axes with equal perturbations in the pair and its single axes",
+            expected="results of the source pairs",
             remedy="run `python -m pipeline evaluate DIR --server URL --source pairs`",
         )
     return counted

@@ -74,7 +74,10 @@ def construct(
     for row in results:
         if row.seed != seed:
             raise PipelineError(
-                f"the result has seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
+                f"the result has seed {row.seed}",
+                where=str(row),
+                expected=f"seed {seed}, as the candidates",
+                remedy=f"set --seed {row.seed}, or leave these results out",
             )
         if row.reason == REJECTED:
             rejected.add(str(row))

@@ -206,6 +206,7 @@ def focus(config: Config, results: Sequence[Attempt], episodes: int | None, limi
             f"{total} episodes for {len(plan.episodes)} entries of plan.episodes",
             where="--episodes",
             expected="at least one for each entry",
+            remedy=f"set --episodes to {len(plan.episodes)} or more, or remove entries",
         )
     axes, tasks = plan.axes.configured(), select_tasks(config.demos.tasks)
     weights = {str(task): plan.task_weights.get(str(task), 1.0) for task in tasks}

@@ -62,7 +62,11 @@ def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
         level = difficulty(solved, len(models))
         graded.append({**asdict(_asked(task, seed)), "solved": solved, "difficulty": level})
     if not graded:
-        raise PipelineError("no task was run by all models", remedy="evaluate all of them with the same --tasks-from")
+        raise PipelineError(
+            "no task was run by all models",
+            expected="results of all models on equal tasks, perturbations and seeds",
+            remedy="evaluate all of them with the same --tasks-from",
+        )
     return graded
 
 

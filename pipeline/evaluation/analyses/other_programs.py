@@ -151,6 +151,7 @@ def read_tested(paths: Sequence[Path]) -> list[TestedPolicy]:
                 "the results have no test task of LIBERO-Plus",
                 where=", ".join(map(str, folders)),
                 expected="results of `evaluate --source libero_plus`",
+                remedy="evaluate on these tasks, or name another folder",
             )
         policies = [*evaluated, *policies]
     _reject_shared_names(policies, paths)

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.evaluation.first_observation.frame_search import CLEAR, FEWEST_PX, Found, Match, middle, search
+from pipeline.evaluation.first_observation.frame_search import (
+    CLEAR,
+    FEWEST_PX,
+    Match,
+    SearchResult,
+    crop_middle,
+    search,
+)
 from pipeline.evaluation.first_observation.picture_fit import (
     FITTING,
     SIZE_PX,
@@ -21,10 +28,10 @@ from pipeline.evaluation.first_observation.picture_fit import (
     difference,
     fit,
     read_picture,
-    smoothed,
+    smooth_picture,
     variants,
 )
-from pipeline.evaluation.first_observation.picture_points import place
+from pipeline.evaluation.first_observation.picture_points import find_transformation
 from pipeline.evaluation.first_observation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, first_start
 from pipeline.images.jpeg import encode_exactly, resized
 from pipeline.libero.starts import SETTLING_STEPS
@@ -99,7 +106,7 @@ class Report:
 
     difference: float
     findings: tuple[Finding, ...]
-    found: Found
+    search_result: SearchResult
 
     @property
     def equal(self) -> bool:
@@ -108,7 +115,7 @@ class Report:
 
     def lines(self) -> list[str]:
         """Return the report in sentences."""
-        match = self.found.match
+        match = self.search_result.match
         text = [f"mean difference from our frame: {self.difference:.1f} of 255 grey levels"]
         for finding in self.findings:
             text += [f"{finding.cause}: {finding.what}", f"  try: {finding.remedy}"]
@@ -116,13 +123,13 @@ class Report:
             text.append("equal: view, orientation, size, colours and start are those of our frame")
         elif match.fit.fits:
             text.append(f"with all of this undone, the mean difference is {match.fit.error:.1f}")
-        if match.fit.fits and _decoded_pixels(self.found).sum() < DECODED_PX:
+        if match.fit.fits and _find_decoded_pixels(self.search_result).sum() < DECODED_PX:
             text.append("this picture cannot tell MuJoCo 3.2.7 from later versions; a picture of libero_object can")
         return text
 
     def as_json(self) -> dict[str, Any]:
         """Return the report for ``json.dumps``."""
-        match = self.found.match
+        match = self.search_result.match
         return {
             "equal": self.equal,
             "difference": round(self.difference, 2),
@@ -154,9 +161,12 @@ def compare_frame(
         PipelineError: if the file is no picture that can be compared, or if there is no such initial state.
     """
     picture, start = read_picture(file), first_start(task, number)
-    found = search(picture, task, start, view, opened, note)
-    findings = (*_picture_findings(picture, found), *_scene_findings(found, start, view, opened))
-    return Report(_raw_difference(picture, found.expected), findings, found)
+    search_result = search(picture, task, start, view, opened, note)
+    findings = (
+        *_find_picture_differences(picture, search_result),
+        *_find_scene_differences(search_result, start, view, opened),
+    )
+    return Report(_measure_raw_difference(picture, search_result.expected_frame), findings, search_result)
 
 
 def write_sheet(report: Report, file: Path) -> None:
@@ -167,20 +177,20 @@ def write_sheet(report: Report, file: Path) -> None:
     Raises:
         PipelineError: if a file would be overwritten that no command wrote.
     """
-    match = report.found.match
+    match = report.search_result.match
     picture = resized(match.variant.pixels, SIZE_PX, SIZE_PX)
-    apart = np.abs(picture.astype(np.int16) - match.frame.astype(np.int16))
-    panels = [picture, match.frame, np.minimum(4 * apart, 255).astype(np.uint8)]
+    level_difference = np.abs(picture.astype(np.int16) - match.frame.astype(np.int16))
+    panels = [picture, match.frame, np.minimum(4 * level_difference, 255).astype(np.uint8)]
     with written(file) as unfinished:
         unfinished.write_bytes(encode_exactly(np.hstack(panels)[..., ::-1]))
 
 
-def _raw_difference(picture: Frame, frame: Frame) -> float:
+def _measure_raw_difference(picture: Frame, frame: Frame) -> float:
     """Return the mean absolute difference of a picture from a frame, resized and otherwise unchanged."""
-    return difference(_variant(picture, UPRIGHT, swapped=False).pixels, frame)
+    return difference(_find_variant(picture, UPRIGHT, swapped=False).pixels, frame)
 
 
-def _variant(picture: Frame, orientation: Orientation, swapped: bool, shape: str | None = None) -> Variant:
+def _find_variant(picture: Frame, orientation: Orientation, swapped: bool, shape: str | None = None) -> Variant:
     """Return a variant of a picture; by default of the first shape that it may have."""
     for variant in variants(picture):
         if (variant.orientation, variant.swapped) == (orientation, swapped) and shape in (None, variant.shape):
@@ -188,219 +198,233 @@ def _variant(picture: Frame, orientation: Orientation, swapped: bool, shape: str
     raise ValueError(f"the picture has no shape {shape}")
 
 
-def _picture_findings(picture: Frame, found: Found) -> Iterator[Finding]:
+def _find_picture_differences(picture: Frame, search_result: SearchResult) -> Iterator[Finding]:
     """Yield the differences of the picture itself: size, shape, orientation, channels, crop."""
-    match = found.match
+    match = search_result.match
     height, width, _ = picture.shape
     if (height, width) != (SIZE_PX, SIZE_PX):
+        resizing = _name_resizing(picture, match)
         yield Finding(
             "size",
-            f"the picture has {width} x {height} pixels, our frame {SIZE_PX} x {SIZE_PX}{_resizing(picture, match)}",
+            f"the picture has {width} x {height} pixels, our frame {SIZE_PX} x {SIZE_PX}{resizing}",
             f"set camera_heights and camera_widths to {SIZE_PX}, or resize as in training",
         )
-    if not (found.clear or match.fit.fits):
+    if not (search_result.is_clear or match.fit.fits):
         return
-    seen = match.variant
-    if seen.shape != "square":
-        content = {"stretched": "its content is stretched", "widened": "it shows more on two sides"}[seen.shape]
+    variant = match.variant
+    if variant.shape != "square":
+        content = {"stretched": "its content is stretched", "widened": "it shows more on two sides"}[variant.shape]
         yield Finding("shape", f"the picture is not square: {content}", "set equal heights and widths")
-    if seen.orientation is not UPRIGHT:
-        before = fit(_variant(picture, UPRIGHT, seen.swapped, seen.shape).smooth, match.frame).error
+    if variant.orientation is not UPRIGHT:
+        error_before = fit(_find_variant(picture, UPRIGHT, variant.swapped, variant.shape).smooth, match.frame).error
         yield Finding(
             "orientation",
-            f"the picture is {seen.orientation.words} ({_change(before, match)})",
-            f"give the policy {seen.orientation.code}",
+            f"the picture is {variant.orientation.words} ({_state_change(error_before, match)})",
+            f"give the policy {variant.orientation.code}",
         )
-    if seen.swapped:
-        before = fit(_variant(picture, seen.orientation, False, seen.shape).smooth, match.frame).error
+    if variant.swapped:
+        error_before = fit(_find_variant(picture, variant.orientation, False, variant.shape).smooth, match.frame).error
         yield Finding(
             "channels",
-            f"red and blue are exchanged ({_change(before, match)})",
+            f"red and blue are exchanged ({_state_change(error_before, match)})",
             "give the policy image[..., ::-1]; nothing if only the file is wrong, as cv2.imwrite expects BGR",
         )
     if match.zoom != 1:
-        share = 100 * min(match.zoom, 1 / match.zoom)
-        parts = f"the middle {share:.0f} % of our frame" if match.zoom > 1 else "more than our frame"
-        before = fit(seen.smooth, match.frame).error
+        percent = 100 * min(match.zoom, 1 / match.zoom)
+        shown_part = f"the middle {percent:.0f} % of our frame" if match.zoom > 1 else "more than our frame"
+        error_before = fit(variant.smooth, match.frame).error
         yield Finding(
             "zoom",
-            f"things are {match.zoom:.2f} times as large ({_change(before, match)}): the picture shows {parts}, by a "
-            "crop or another field of view",
+            f"things are {match.zoom:.2f} times as large ({_state_change(error_before, match)}): the picture shows "
+            f"{shown_part}, by a crop or another field of view",
             "crop as in training, or not at all, and keep LIBERO's field of view",
         )
 
 
-def _change(before: float, match: Match) -> str:
-    """State the difference that a cause explains."""
-    return f"mean difference {match.fit.error:.1f} instead of {before:.1f} grey levels with this undone"
+def _state_change(error_before: float, match: Match) -> str:
+    """State the difference that a cause explains.
+
+    Args:
+        error_before: mean difference while the cause is not undone.
+    """
+    return f"mean difference {match.fit.error:.1f} instead of {error_before:.1f} grey levels with this undone"
 
 
-def _resizing(picture: Frame, match: Match) -> str:
+def _name_resizing(picture: Frame, match: Match) -> str:
     """Name the resizing of our frame that gives the picture, if exactly one does."""
     if not match.fit.fits or match.variant.shape != "square" or match.zoom != 1:
         return ""
-    full = match.variant.orientation.undo(picture[..., ::-1] if match.variant.swapped else picture).astype(np.int16)
-    side = len(full)
+    undone = match.variant.orientation.undo(picture[..., ::-1] if match.variant.swapped else picture).astype(np.int16)
+    side = len(undone)
     errors: dict[str, float] = {}
     for name, method in OPENCV_RESIZING.items():
-        errors[name] = float(np.abs(full - cv2.resize(match.frame, (side, side), interpolation=method)).mean())
+        errors[name] = float(np.abs(undone - cv2.resize(match.frame, (side, side), interpolation=method)).mean())
     for name, filter_ in PILLOW_RESIZING.items():
-        ours = np.asarray(Image.fromarray(match.frame).resize((side, side), filter_))
-        errors[name] = float(np.abs(full - ours).mean())
+        resized_frame = np.asarray(Image.fromarray(match.frame).resize((side, side), filter_))
+        errors[name] = float(np.abs(undone - resized_frame).mean())
     best, second = sorted(errors, key=lambda name: errors[name])[:2]
     if errors[best] <= SAME_RESIZING and errors[best] <= CLEAR * errors[second]:
         return f", resized by {best} ({errors[best]:.1f} grey levels)"
     return ", resized or rendered in this size"
 
 
-def _scene_findings(found: Found, start: Start, view: str, opened: LastStartFrames) -> Iterator[Finding]:
+def _find_scene_differences(
+    search_result: SearchResult, start: Start, view: str, opened: LastStartFrames
+) -> Iterator[Finding]:
     """Yield the differences of the scene: camera, MuJoCo, light, start, task."""
-    match = found.match
-    trusted = found.clear or match.fit.fits
-    if trusted and match.camera != CAMERA_OF_VIEW[view]:
-        names = {camera: name for name, camera in CAMERA_OF_VIEW.items()}
+    match = search_result.match
+    is_trusted = search_result.is_clear or match.fit.fits
+    if is_trusted and match.camera != CAMERA_OF_VIEW[view]:
+        view_of_camera = {camera: name for name, camera in CAMERA_OF_VIEW.items()}
         yield Finding(
             "view",
             f"the picture shows the camera {match.camera}"
-            + (f", the view {names[match.camera]}" if match.camera in names else "")
+            + (f", the view {view_of_camera[match.camera]}" if match.camera in view_of_camera else "")
             + f", not {CAMERA_OF_VIEW[view]} (mean difference {match.fit.error:.1f} grey levels)",
             f"give the policy {CAMERA_OF_VIEW[view]}_image",
         )
     if not match.fit.fits:
-        yield from _unmatched(found, opened)
+        yield from _explain_unmatched(search_result, opened)
         return
-    yield from _version(found)
+    yield from _find_version_difference(search_result)
     if abs(match.fit.brightness - 1) > BRIGHTNESS:
         yield Finding(
             "brightness",
             f"the whole picture has {match.fit.brightness:.2f} times the brightness of our frame",
             "leave out changes of brightness, gamma and light",
         )
-    yield from _start_findings(found, start)
+    yield from _find_start_differences(search_result, start)
 
 
-def _version(found: Found) -> Iterator[Finding]:
+def _find_version_difference(search_result: SearchResult) -> Iterator[Finding]:
     """Report the MuJoCo whose textures the picture shows, from the pixels that differ between versions."""
-    match = found.match
-    own, decoded = (_smooth_as(match, frame) for frame in found.versions)
-    shown = _decoded_pixels(found)
-    if shown.sum() < DECODED_PX:
+    match = search_result.match
+    plain_frame, decoded_frame = (_smooth_like(match, frame) for frame in search_result.version_frames)
+    decoded_pixels = _find_decoded_pixels(search_result)
+    if decoded_pixels.sum() < DECODED_PX:
         return
     picture = match.variant.smooth / match.fit.brightness
-    from_own, from_decoded = (float(np.abs(picture - frame)[shown].mean()) for frame in (own, decoded))
-    if from_decoded <= from_own / 2:
-        darker = float((own - picture)[shown].mean())
+    from_plain = float(np.abs(picture - plain_frame)[decoded_pixels].mean())
+    from_decoded = float(np.abs(picture - decoded_frame)[decoded_pixels].mean())
+    if from_decoded <= from_plain / 2:
+        darker = float((plain_frame - picture)[decoded_pixels].mean())
         yield Finding(
             "mujoco",
-            f"{100 * shown.mean():.1f} % of the pixels, most of them floor, are darker by {darker:.0f} grey levels. "
-            f"They differ by {from_decoded:.1f} from MuJoCo {FIRST_VERSION} and later, and by {from_own:.1f} from "
-            "MuJoCo 3.2.7",
+            f"{100 * decoded_pixels.mean():.1f} % of the pixels, most of them floor, are darker by {darker:.0f} grey "
+            f"levels. They differ by {from_decoded:.1f} from MuJoCo {FIRST_VERSION} and later, and by {from_plain:.1f} "
+            "from MuJoCo 3.2.7",
             PIN,
         )
 
 
-def _decoded_pixels(found: Found) -> NDArray[np.bool_]:
+def _find_decoded_pixels(search_result: SearchResult) -> NDArray[np.bool_]:
     """Return a mask (S, S) of the pixels that show the textures' version."""
-    own, decoded = (_smooth_as(found.match, frame) for frame in found.versions)
-    return np.asarray(np.abs(own - decoded).max(axis=2) > DECODED_LEVELS)
+    plain_frame, decoded_frame = (_smooth_like(search_result.match, frame) for frame in search_result.version_frames)
+    return np.asarray(np.abs(plain_frame - decoded_frame).max(axis=2) > DECODED_LEVELS)
 
 
-def _smooth_as(match: Match, frame: Frame) -> Smooth:
+def _smooth_like(match: Match, frame: Frame) -> Smooth:
     """Return our frame smoothed, in the size of the picture."""
     side = len(match.variant.pixels)
-    return smoothed(resized(middle(frame, 1 / match.zoom) if match.zoom > 1 else frame, side, side))
+    shown = crop_middle(frame, 1 / match.zoom) if match.zoom > 1 else frame
+    return smooth_picture(resized(shown, side, side))
 
 
-def _start_findings(found: Found, start: Start) -> Iterator[Finding]:
+def _find_start_differences(search_result: SearchResult, start: Start) -> Iterator[Finding]:
     """Yield the differences of the start and of the task."""
-    match = found.match
-    before = f"mean difference {match.fit.error:.1f} grey levels"
-    other_steps = sorted(other.start.steps for other in (match, *found.others) if other.start.gripper == start.gripper)
+    match = search_result.match
+    measured = f"mean difference {match.fit.error:.1f} grey levels"
+    starts = [match.start, *(equal_match.start for equal_match in search_result.equal_matches)]
+    possible_steps = sorted(possible.steps for possible in starts if possible.gripper == start.gripper)
     if match.start.gripper != start.gripper:
         command = {1.0: "closed", 0.0: "without a command"}[match.start.gripper]
-        yield Finding("gripper", f"the gripper was {command} while the scene settled ({before})", SETTLE)
+        yield Finding("gripper", f"the gripper was {command} while the scene settled ({measured})", SETTLE)
     elif match.start.steps != start.steps:
-        steps = " or ".join(map(str, other_steps))
-        yield Finding("not_settled", f"the scene has settled for {steps} of {start.steps} steps ({before})", SETTLE)
+        steps = " or ".join(map(str, possible_steps))
+        yield Finding("not_settled", f"the scene has settled for {steps} of {start.steps} steps ({measured})", SETTLE)
     if match.start.number != start.number:
         yield Finding(
             "initial_state",
-            f"the picture shows LIBERO's initial state {match.start.number}, not {start.number} ({before})",
+            f"the picture shows LIBERO's initial state {match.start.number}, not {start.number} ({measured})",
             f"env.set_init_state(states[{start.number}]) after env.reset()",
         )
     if match.start.seed != start.seed:
         yield Finding(
             "reset_seed",
-            f"the fixtures stand as after a reset with seed {match.start.seed}, not {start.seed} ({before})",
+            f"the fixtures stand as after a reset with seed {match.start.seed}, not {start.seed} ({measured})",
             f"nothing, as LIBERO's demonstrations vary likewise; our frame needs env.seed({start.seed})",
         )
-    if match.task.name != found.task.name:
-        yield Finding("task", f"the picture shows the task {match.task.name} ({before})", f"open {found.task.name}")
+    if match.task.name != search_result.task.name:
+        yield Finding(
+            "task", f"the picture shows the task {match.task.name} ({measured})", f"open {search_result.task.name}"
+        )
 
 
-def _unmatched(found: Found, opened: LastStartFrames) -> Iterator[Finding]:
+def _explain_unmatched(search_result: SearchResult, opened: LastStartFrames) -> Iterator[Finding]:
     """Report a picture that no start of the scene fits: a moved camera, moved things, other colours, or nothing."""
-    match = found.match
-    left = f"the best match leaves {match.fit.error:.1f} grey levels, {match.fit.worst:.0f} in a patch of 16 pixels"
-    placed = place(match.variant.pixels, match.frame)
-    if placed is None or not (found.clear or placed.still or placed.moved):
-        yield Finding("unknown", f"nothing explains the picture; {left}", "check the task and the camera")
+    match = search_result.match
+    remainder = (
+        f"the best match leaves {match.fit.error:.1f} grey levels, {match.fit.worst:.0f} in a patch of 16 pixels"
+    )
+    transformation = find_transformation(match.variant.pixels, match.frame)
+    if transformation is None or not (search_result.is_clear or transformation.still or transformation.moved):
+        yield Finding("unknown", f"nothing explains the picture; {remainder}", "check the task and the camera")
         return
-    if not placed.still:
+    if not transformation.still:
         carrier = " or of the hand, which carries it" if match.camera == CAMERA_OF_VIEW["wrist"] else ""
         yield Finding(
             "camera_pose",
-            f"{placed.points} points of our frame are elsewhere: shifted by {placed.shift_px:.0f} pixels of {SIZE_PX}, "
-            f"{placed.scale:.2f} times as large, rotated by {placed.rotation_deg:.0f} degrees. The pose of the camera"
-            f"{carrier} differs; {left}",
+            f"{transformation.points} points of our frame are elsewhere: shifted by {transformation.shift_px:.0f} "
+            f"pixels of {SIZE_PX}, {transformation.scale:.2f} times as large, rotated by "
+            f"{transformation.rotation_deg:.0f} degrees. The pose of the camera{carrier} differs; {remainder}",
             "keep LIBERO's camera agentview and its field of view",
         )
         return
-    apart, surroundings = _things_apart(match, opened)
-    if match.task.name == RAMEKIN and apart and not {COMMON[ROBOT], COMMON[GRIPPER]} & apart.keys():
+    things, background_level = _find_differing_things(match, opened)
+    if match.task.name == RAMEKIN and things and not {COMMON[ROBOT], COMMON[GRIPPER]} & things.keys():
         yield Finding(
             "mujoco",
-            f"{_listed(apart)} lie elsewhere. From MuJoCo 3.4.0 on, the bowl slides off the ramekin "
-            f"(huggingface/lerobot#4390); no other start fits, {left}",
+            f"{_list_things(things)} lie elsewhere. From MuJoCo 3.4.0 on, the bowl slides off the ramekin "
+            f"(huggingface/lerobot#4390); no other start fits, {remainder}",
             PIN,
         )
-    elif apart and surroundings <= FITTING:
+    elif things and background_level <= FITTING:
         yield Finding(
             "things",
-            f"the camera is ours ({placed.points} points), but {_listed(apart)} differ. None of LIBERO's initial "
-            f"states, numbers of settling steps and tried seeds fits; {left}",
+            f"the camera is ours ({transformation.points} points), but {_list_things(things)} differ. None of LIBERO's "
+            f"initial states, numbers of settling steps and tried seeds fits; {remainder}",
             f"env.set_init_state after env.reset(), then {SETTLE}",
         )
     else:
         yield Finding(
             "colours",
-            f"the camera is ours ({placed.points} points), but light or textures differ; {left}",
+            f"the camera is ours ({transformation.points} points), but light or textures differ; {remainder}",
             "use LIBERO's own scene files, light and textures",
         )
 
 
-def _listed(apart: dict[str, float]) -> str:
+def _list_things(level_of_thing: dict[str, float]) -> str:
     """List things with their differences."""
-    return ", ".join(f"{name} ({level:.0f} grey levels)" for name, level in apart.items())
+    return ", ".join(f"{name} ({level:.0f} grey levels)" for name, level in level_of_thing.items())
 
 
-def _things_apart(match: Match, opened: LastStartFrames) -> tuple[dict[str, float], float]:
+def _find_differing_things(match: Match, opened: LastStartFrames) -> tuple[dict[str, float], float]:
     """Find the robot and the movable things that differ, with the mean difference of their pixels, largest first.
 
     Returns:
         The things, and the mean difference of the pixels of floor, walls and table.
     """
     side = len(match.fit.residual)
-    things = opened.of(match.task).things(match.start, match.camera)
-    apart: dict[str, float] = {}
+    pixels_of_thing = opened.of(match.task).things(match.start, match.camera)
+    level_of_thing: dict[str, float] = {}
     background = np.zeros((side, side), np.bool_)
-    for name, pixels in things.items():
-        seen = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0
+    for name, pixels in pixels_of_thing.items():
+        mask = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0
         if name in BACKGROUND:
-            background |= seen
-        elif seen.sum() >= FEWEST_PX:
-            level = float(match.fit.residual[seen].mean())
+            background |= mask
+        elif mask.sum() >= FEWEST_PX:
+            level = float(match.fit.residual[mask].mean())
             if level > FITTING:
-                apart[name] = level
-    surroundings = float(match.fit.residual[background].mean()) if background.any() else 0.0
-    return dict(sorted(apart.items(), key=lambda item: -item[1])), surroundings
+                level_of_thing[name] = level
+    background_level = float(match.fit.residual[background].mean()) if background.any() else 0.0
+    return dict(sorted(level_of_thing.items(), key=lambda item: -item[1])), background_level

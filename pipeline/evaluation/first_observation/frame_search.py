@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from pipeline.errors import RejectedError
-from pipeline.evaluation.first_observation.picture_fit import Fit, Smooth, Variant, fit, smoothed, variants
-from pipeline.evaluation.first_observation.picture_points import place
+from pipeline.evaluation.first_observation.picture_fit import Fit, Smooth, Variant, fit, smooth_picture, variants
+from pipeline.evaluation.first_observation.picture_points import find_transformation
 from pipeline.evaluation.first_observation.start_frames import CAMERA_OF_VIEW, LastStartFrames, Start, StartFrames
 from pipeline.libero import bddl
 from pipeline.libero import tasks as libero_tasks
@@ -68,29 +68,29 @@ class Match:
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """Result of a search.
 
     Attributes:
         task: the task that the picture should show.
         match: the best match.
-        others: the other starts of the same group that fit as well.
-        expected: our frame of the expected view and start.
-        versions: our frame of the match with the textures of MuJoCo 3.2.7, and of 3.3.3.
-        clear: True if no other view, orientation or order of channels comes close to the match.
+        equal_matches: matches of the other starts of the same group that fit as well.
+        expected_frame: our frame of the expected view and start.
+        version_frames: our frame of the match with the textures of MuJoCo 3.2.7, and of 3.3.3.
+        is_clear: True if no other view, orientation or order of channels comes close to the match.
     """
 
     task: Task
     match: Match
-    others: tuple[Match, ...]
-    expected: Frame
-    versions: tuple[Frame, Frame]
-    clear: bool
+    equal_matches: tuple[Match, ...]
+    expected_frame: Frame
+    version_frames: tuple[Frame, Frame]
+    is_clear: bool
 
 
 def search(
     picture: Frame, task: Task, start: Start, view: str, opened: LastStartFrames, note: Callable[[str], None]
-) -> Found:
+) -> SearchResult:
     """Search for the match of a picture.
 
     Args:
@@ -101,105 +101,108 @@ def search(
     Raises:
         PipelineError: if the task cannot be rebuilt on this machine.
     """
-    frames = opened.of(task)
-    candidates = list(_appearances(picture, frames, start, list(CAMERA_OF_VIEW.values())))
-    expected = next(match.frame for match in candidates if match.camera == CAMERA_OF_VIEW[view] and not match.srgb)
-    match, clear = _clear_best(candidates)
-    if not clear:
+    frames, view_cameras = opened.of(task), list(CAMERA_OF_VIEW.values())
+    candidates = list(_match_appearances(picture, frames, start, view_cameras))
+    expected_frame = next(
+        match.frame for match in candidates if match.camera == CAMERA_OF_VIEW[view] and not match.srgb
+    )
+    match, is_clear = _find_best_appearance(candidates)
+    if not is_clear:
         note("none of the two views fits: searching other cameras")
-        rest = [camera for camera in frames.cameras if camera not in CAMERA_OF_VIEW.values()]
-        candidates += _appearances(picture, frames, start, rest)
-        match, clear = _clear_best(candidates)
+        other_cameras = [camera for camera in frames.cameras if camera not in view_cameras]
+        candidates += _match_appearances(picture, frames, start, other_cameras)
+        match, is_clear = _find_best_appearance(candidates)
     if not match.fit.fits:
-        coarse = _best(_zooms(match, ZOOMS.tolist()))
-        finer = (coarse.zoom * FINER).tolist()
-        match = _best([match, *_fitting(_zooms(match, finer))])
-    others: tuple[Match, ...] = ()
+        best_zoom = _find_best(_match_zooms(match, ZOOMS.tolist())).zoom
+        match = _find_best([match, *_select_fitting(_match_zooms(match, (best_zoom * FINER).tolist()))])
+    equal_matches: tuple[Match, ...] = ()
     if match.fit.fits:
-        return Found(task, match, others, expected, _versions(frames, match), clear)
-    placed = place(match.variant.pixels, match.frame)
-    moved = placed is not None and placed.moved
-    right_state = False
-    if clear and not moved:
-        right_state = _objects_in_place(match, frames)
-        match, others = _search_starts(match, frames, right_state, note)
-    if match.fit.fits or moved or right_state:
-        return Found(task, match, others, expected, _versions(frames, match), clear)
-    for task_of_suite in _others(task):
-        note(f"searching {task_of_suite}")
-        frames = opened.of(task_of_suite)
-        other, distinct = _clear_best(list(_appearances(picture, frames, start, list(CAMERA_OF_VIEW.values()))))
-        if other.fit.fits:
-            return Found(task, other, (), expected, _versions(frames, other), distinct)
-    return Found(task, match, others, expected, _versions(opened.of(task), match), clear)
+        return SearchResult(task, match, equal_matches, expected_frame, _render_versions(frames, match), is_clear)
+    transformation = find_transformation(match.variant.pixels, match.frame)
+    camera_moved = transformation is not None and transformation.moved
+    objects_in_place = False
+    if is_clear and not camera_moved:
+        objects_in_place = _are_objects_in_place(match, frames)
+        match, equal_matches = _search_starts(match, frames, objects_in_place, note)
+    if match.fit.fits or camera_moved or objects_in_place:
+        return SearchResult(task, match, equal_matches, expected_frame, _render_versions(frames, match), is_clear)
+    for other_task in _list_other_tasks(task):
+        note(f"searching {other_task}")
+        other_frames = opened.of(other_task)
+        appearances = list(_match_appearances(picture, other_frames, start, view_cameras))
+        other_match, other_is_clear = _find_best_appearance(appearances)
+        if other_match.fit.fits:
+            version_frames = _render_versions(other_frames, other_match)
+            return SearchResult(task, other_match, (), expected_frame, version_frames, other_is_clear)
+    return SearchResult(task, match, equal_matches, expected_frame, _render_versions(opened.of(task), match), is_clear)
 
 
-def _clear_best(candidates: list[Match]) -> tuple[Match, bool]:
+def _find_best_appearance(candidates: list[Match]) -> tuple[Match, bool]:
     """Return the best match, and whether no other camera, orientation or order of channels comes close."""
-    match = _best(candidates)
-    another = min(other.fit.error for other in candidates if _differs(other, match))
-    return match, match.fit.error <= CLEAR * another
+    match = _find_best(candidates)
+    next_error = min(candidate.fit.error for candidate in candidates if _differs(candidate, match))
+    return match, match.fit.error <= CLEAR * next_error
 
 
-def _objects_in_place(match: Match, frames: StartFrames) -> bool:
+def _are_objects_in_place(match: Match, frames: StartFrames) -> bool:
     """Return whether half of the movable objects are where they are in our frame: then the initial state is right."""
     objects = bddl.read(match.task.bddl_file).objects
     side = len(match.fit.residual)
     residuals: list[float] = []
     for name, pixels in frames.things(match.start, match.camera).items():
-        seen = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0
-        if name in objects and seen.sum() >= FEWEST_PX:
-            residuals.append(float(match.fit.residual[seen].mean()))
+        mask = cv2.resize(pixels.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST) > 0
+        if name in objects and mask.sum() >= FEWEST_PX:
+            residuals.append(float(match.fit.residual[mask].mean()))
     return bool(residuals) and float(np.median(residuals)) <= IN_PLACE
 
 
 def _search_starts(
-    match: Match, frames: StartFrames, right_state: bool, note: Callable[[str], None]
+    match: Match, frames: StartFrames, objects_in_place: bool, note: Callable[[str], None]
 ) -> tuple[Match, tuple[Match, ...]]:
-    """Search other starts of the task; return the best match, and the others of its group that fit.
+    """Search other starts of the task; return the best match, and the other matches of its group that fit.
 
     Args:
-        right_state: True if other initial states need no search.
+        objects_in_place: True if other initial states need no search.
     """
     best = match
-    for group, starts in _starts(match.start, 0 if right_state else frames.count):
+    for group, starts in _group_starts(match.start, 0 if objects_in_place else frames.count):
         note(f"searching {group}")
-        tried = list(_matches(match, frames, starts))
-        best = _best([best, *tried])
+        matches = list(_match_starts(match, frames, starts))
+        best = _find_best([best, *matches])
         if best.fit.fits:
-            return best, tuple(other for other in _fitting(tried) if other.start != best.start)
+            return best, tuple(fitting for fitting in _select_fitting(matches) if fitting.start != best.start)
     if best.start.number != match.start.number:
-        seeds = [best.start._replace(seed=seed) for seed in (best.start.number, *SEEDS)]
-        best = _best([best, *_matches(match, frames, seeds)])
+        resets = [best.start._replace(seed=seed) for seed in (best.start.number, *SEEDS)]
+        best = _find_best([best, *_match_starts(match, frames, resets)])
     return best, ()
 
 
-def _versions(frames: StartFrames, match: Match) -> tuple[Frame, Frame]:
+def _render_versions(frames: StartFrames, match: Match) -> tuple[Frame, Frame]:
     """Return our frame of a match with the textures of MuJoCo 3.2.7, and of 3.3.3."""
     plain, decoded = (frames.render(match.start, [match.camera], srgb)[match.camera] for srgb in (False, True))
     return plain, decoded
 
 
-def _others(task: Task) -> list[Task]:
+def _list_other_tasks(task: Task) -> list[Task]:
     """List the other tasks of a suite; of a large suite, one task of each other scene."""
-    listed = [other for other in libero_tasks.tasks(task.suite) if other.name != task.name]
-    if len(listed) < FEW_TASKS:
-        return listed
-    by_scene = {libero_tasks.common_key(other, "scene"): other for other in reversed(listed)}
+    other_tasks = [other for other in libero_tasks.tasks(task.suite) if other.name != task.name]
+    if len(other_tasks) < FEW_TASKS:
+        return other_tasks
+    by_scene = {libero_tasks.common_key(other, "scene"): other for other in reversed(other_tasks)}
     by_scene.pop(libero_tasks.common_key(task, "scene"), None)
     return list(reversed(by_scene.values()))
 
 
-def _appearances(picture: Frame, frames: StartFrames, start: Start, cameras: list[str]) -> Iterator[Match]:
+def _match_appearances(picture: Frame, frames: StartFrames, start: Start, cameras: list[str]) -> Iterator[Match]:
     """Yield a match for each camera, version of textures and variant of the picture."""
-    undone = list(variants(picture))
+    picture_variants = list(variants(picture))
     for srgb in (False, True):
         for camera, frame in frames.render(start, cameras, srgb).items():
-            for variant in undone:
+            for variant in picture_variants:
                 yield Match(variant, frames.task, camera, start, srgb, frame, fit(variant.smooth, frame))
 
 
-def _starts(start: Start, count: int) -> Iterator[tuple[str, list[Start]]]:
+def _group_starts(start: Start, count: int) -> Iterator[tuple[str, list[Start]]]:
     """Yield groups of other starts, each with its name."""
     unsettled = [start._replace(steps=steps) for steps in UNSETTLED]
     grippers = [start._replace(gripper=gripper) for gripper in GRIPPERS]
@@ -208,50 +211,50 @@ def _starts(start: Start, count: int) -> Iterator[tuple[str, list[Start]]]:
     yield "other initial states", [start._replace(number=number) for number in range(count) if number != start.number]
 
 
-def _matches(like: Match, frames: StartFrames, starts: Iterable[Start]) -> Iterator[Match]:
+def _match_starts(match: Match, frames: StartFrames, starts: Iterable[Start]) -> Iterator[Match]:
     """Yield the match of each start in the camera and variant of another match; skip starts that do not settle."""
     for start in starts:
         try:
-            frame = frames.render(start, [like.camera], like.srgb)[like.camera]
+            frame = frames.render(start, [match.camera], match.srgb)[match.camera]
         except RejectedError:
             continue
-        yield replace(like, start=start, frame=frame, fit=fit(like.variant.smooth, frame))
+        yield replace(match, start=start, frame=frame, fit=fit(match.variant.smooth, frame))
 
 
-def _zooms(match: Match, zooms: list[float]) -> Iterator[Match]:
+def _match_zooms(match: Match, zooms: list[float]) -> Iterator[Match]:
     """Yield the match at other sizes of things: the picture is a part of the frame, or the frame is a part of it."""
     for zoom in zooms:
         if zoom > 1:
-            yield replace(match, zoom=zoom, fit=fit(match.variant.smooth, middle(match.frame, 1 / zoom)))
+            yield replace(match, zoom=zoom, fit=fit(match.variant.smooth, crop_middle(match.frame, 1 / zoom)))
         else:
-            part: Smooth = smoothed(middle(match.variant.pixels, zoom))
-            yield replace(match, zoom=zoom, fit=fit(part, match.frame))
+            middle: Smooth = smooth_picture(crop_middle(match.variant.pixels, zoom))
+            yield replace(match, zoom=zoom, fit=fit(middle, match.frame))
 
 
-def middle(image: Frame, share: float) -> Frame:
+def crop_middle(image: Frame, share: float) -> Frame:
     """Return the middle of a square image, enlarged to the image's size.
 
     Args:
         share: side of the middle in multiples of the image's.
     """
     side = len(image)
-    part = round(side * share)
-    first = (side - part) // 2
-    cut = image[first : first + part, first : first + part]
-    return np.asarray(cv2.resize(cut, (side, side), interpolation=cv2.INTER_LINEAR), np.uint8)
+    middle_side = round(side * share)
+    first = (side - middle_side) // 2
+    middle = image[first : first + middle_side, first : first + middle_side]
+    return np.asarray(cv2.resize(middle, (side, side), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-def _best(matches: Iterable[Match]) -> Match:
+def _find_best(matches: Iterable[Match]) -> Match:
     """Return the match with the smallest error, a fitting one if there is any; of equal ones the first."""
     return min(matches, key=lambda match: (not match.fit.fits, match.fit.error))
 
 
-def _fitting(matches: Iterable[Match]) -> list[Match]:
+def _select_fitting(matches: Iterable[Match]) -> list[Match]:
     """List the matches that fit."""
     return [match for match in matches if match.fit.fits]
 
 
-def _differs(other: Match, match: Match) -> bool:
-    """Return whether a match has another camera, orientation or order of channels."""
-    seen = (other.camera, other.variant.orientation, other.variant.swapped)
-    return seen != (match.camera, match.variant.orientation, match.variant.swapped)
+def _differs(first: Match, second: Match) -> bool:
+    """Return whether two matches differ in camera, orientation or order of channels."""
+    first_appearance = (first.camera, first.variant.orientation, first.variant.swapped)
+    return first_appearance != (second.camera, second.variant.orientation, second.variant.swapped)

@@ -147,15 +147,15 @@ def read_picture(file: Path) -> Frame:
 
 def variants(picture: Frame) -> Iterator[Variant]:
     """Yield the picture with each orientation, order of channels and shape undone."""
-    for shape, square in _squares(picture).items():
+    for shape, square in _cut_squares(picture).items():
         for swapped in (False, True):
             coloured = square[..., ::-1] if swapped else square
             for orientation in ORIENTATIONS:
                 pixels = np.ascontiguousarray(orientation.undo(coloured))
-                yield Variant(orientation, swapped, shape, pixels, smoothed(pixels))
+                yield Variant(orientation, swapped, shape, pixels, smooth_picture(pixels))
 
 
-def _squares(picture: Frame) -> dict[str, Frame]:
+def _cut_squares(picture: Frame) -> dict[str, Frame]:
     """Return the shapes that a picture may have, each cut or resized to a square of at most ``SIZE_PX``."""
     height, width, _ = picture.shape
     side = min(height, width)
@@ -167,7 +167,7 @@ def _squares(picture: Frame) -> dict[str, Frame]:
     return {"stretched": resized(picture, target, target), "widened": resized(middle, target, target)}
 
 
-def smoothed(pixels: Frame) -> Smooth:
+def smooth_picture(pixels: Frame) -> Smooth:
     """Smooth a square picture."""
     deviation_px = SMOOTH_PX * len(pixels) / SIZE_PX
     return np.asarray(cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), deviation_px), np.float32)
@@ -176,15 +176,15 @@ def smoothed(pixels: Frame) -> Smooth:
 def fit(picture: Smooth, frame: Frame) -> Fit:
     """Compare a smoothed picture (S, S, 3) with a rendered frame (256, 256, 3)."""
     side = len(picture)
-    reference = smoothed(resized(frame, side, side))
-    brightness = _brightness(picture, reference)
+    reference = smooth_picture(resized(frame, side, side))
+    brightness = _measure_brightness(picture, reference)
     residual = np.abs(picture - brightness * reference).mean(axis=2)
     patch_px = max(round(PATCH_PX * side / SIZE_PX), 1)
     worst = float(cv2.blur(residual, (patch_px, patch_px), borderType=cv2.BORDER_REFLECT).max())
     return Fit(brightness, float(residual.mean()), worst, residual)
 
 
-def _brightness(picture: Smooth, reference: Smooth) -> float:
+def _measure_brightness(picture: Smooth, reference: Smooth) -> float:
     """Return the median brightness of a picture in multiples of the reference's; 1.0 if the reference is black."""
     bright = reference.mean(axis=2) > DARK
     if not bright.any():

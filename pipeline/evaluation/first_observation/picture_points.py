@@ -26,7 +26,7 @@ STILL_PX = 1.5
 """Largest shift of points of an unmoved camera."""
 
 
-class Place(NamedTuple):
+class Transformation(NamedTuple):
     """Transformation of our frame into a picture, by rotation, scale and shift; all pixels are pixels of 256.
 
     Attributes:
@@ -52,18 +52,18 @@ class Place(NamedTuple):
         return not self.still and self.points >= MANY_POINTS and self.share >= MOST_POINTS
 
 
-def place(picture: Frame, frame: Frame) -> Place | None:
+def find_transformation(picture: Frame, frame: Frame) -> Transformation | None:
     """Find the transformation of the largest group of common points; `None` if the group is too small.
 
     The first group that is searched has points at equal places, so moved things do not count as a moved camera.
     """
-    ours, theirs = _common_points(frame, picture)
+    ours, theirs = _match_points(frame, picture)
     if len(ours) < FEWEST_POINTS:
         return None
     still = np.linalg.norm(theirs - ours, axis=1) <= STILL_PX
     if still.sum() >= max(FEWEST_POINTS, len(ours) / 2):
         shift_px = float(np.median(np.linalg.norm(theirs - ours, axis=1)[still]))
-        return Place(int(still.sum()), float(still.mean()), shift_px, 1.0, 0.0)
+        return Transformation(int(still.sum()), float(still.mean()), shift_px, 1.0, 0.0)
     cv2.setRNGSeed(0)
     matrix, agree = cv2.estimateAffinePartial2D(ours, theirs, ransacReprojThreshold=TOLERANCE_PX)
     if matrix is None or agree.sum() < FEWEST_POINTS:
@@ -72,13 +72,13 @@ def place(picture: Frame, frame: Frame) -> Place | None:
     shift_px = float(np.median(np.linalg.norm(theirs - ours, axis=1)[inside]))
     scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
     rotation_deg = float(np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0])))
-    return Place(int(inside.sum()), float(inside.mean()), shift_px, scale, rotation_deg)
+    return Transformation(int(inside.sum()), float(inside.mean()), shift_px, scale, rotation_deg)
 
 
-def _common_points(frame: Frame, picture: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _match_points(frame: Frame, picture: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the places (N, 2) of common points in our frame and in a picture, by SIFT's descriptors."""
-    our_places, ours = _points(frame)
-    their_places, theirs = _points(picture)
+    our_places, ours = _detect_points(frame)
+    their_places, theirs = _detect_points(picture)
     pairs: list[tuple[int, int]] = []
     if len(ours) > 1 and len(theirs) > 1:
         for best, second in cv2.BFMatcher().knnMatch(ours, theirs, k=2):
@@ -88,7 +88,7 @@ def _common_points(frame: Frame, picture: Frame) -> tuple[NDArray[np.float32], N
     return our_places[indices[:, 0]], their_places[indices[:, 1]]
 
 
-def _points(image: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _detect_points(image: Frame) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the places (N, 2) of an image's points and their descriptors (N, 128)."""
     grey = cv2.cvtColor(resized(image, SIZE_PX, SIZE_PX), cv2.COLOR_RGB2GRAY)
     everywhere = np.full(grey.shape, 255, np.uint8)
