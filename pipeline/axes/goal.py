@@ -22,6 +22,7 @@ from pipeline.files import checksum
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
 from pipeline.libero.carried import CannotCarryError, carried, definition_of
+from pipeline.libero.task_goal import has_lookalike_in_place
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, RollOut, Scene, Task
@@ -96,9 +97,13 @@ def held_out(suite: str) -> frozenset[tuple[Task, Task]]:
 
 @cache
 def _trained(task: Task) -> tuple[Task, ...]:
-    """List the scenes to which plans carry a task."""
-    scenes = [pair.scene for pair in usable(task.suite) if pair.task == task]
-    return tuple(scene for scene in scenes if (task, scene) not in held_out(task.suite))
+    """List the scenes to which plans carry a task.
+
+    Pairs are left out that are held out, or whose scene has another object in the place that the instruction names.
+    """
+    pairs_of_task = [pair for pair in usable(task.suite) if pair.task == task]
+    not_held_out = [pair for pair in pairs_of_task if (task, pair.scene) not in held_out(task.suite)]
+    return tuple(pair.scene for pair in not_held_out if not has_lookalike_in_place(pair.played))
 
 
 @cache

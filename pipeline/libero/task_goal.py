@@ -7,7 +7,7 @@ holds.
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -307,16 +307,45 @@ def relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bo
         target: name of an object.
         xy_m: function that returns the position (2,) of an object.
     """
-    target_m = xy_m(target)
-    match _anchors(task, target):
-        case (anchor,):
-            distance_m = np.linalg.norm(target_m - xy_m(anchor))
-            distances_alike_m = [np.linalg.norm(xy_m(name) - xy_m(anchor)) for name in _alike(task, target)]
-            nearest_alike_m = min(distances_alike_m, default=math.inf)
-            return bool(distance_m <= min(NEXT_TO_M, nearest_alike_m))
-        case (first, second):
-            line = xy_m(second) - xy_m(first)
-            dx, dy = target_m - xy_m(first)
-            along, across = np.array([dx * line[0] + dy * line[1], dx * line[1] - dy * line[0]]) / (line @ line)
-            return bool(BETWEEN <= along <= 1 - BETWEEN and abs(across) <= BETWEEN)
-    return True
+    anchors = _anchors(task, target)
+    if not anchors:
+        return True
+    anchors_m = [xy_m(anchor) for anchor in anchors]
+    if len(anchors_m) == 1:
+        distances_alike_m = [np.linalg.norm(xy_m(name) - anchors_m[0]) for name in _alike(task, target)]
+        if np.linalg.norm(xy_m(target) - anchors_m[0]) > min(distances_alike_m, default=math.inf):
+            return False
+    return _is_at(anchors_m, xy_m(target))
+
+
+def has_lookalike_in_place(task: Task) -> bool:
+    """Return whether another object of a target's category also begins in the place that the instruction names.
+
+    An instruction with the place then fits both objects. The centres of the regions are compared.
+    """
+    centres_m = {name: np.array(centre_m) for name, centre_m in definition_of(task).centres_m.items()}
+    for target in definition_of(task).targets:
+        anchors = _anchors(task, target)
+        if not anchors or not centres_m.keys() >= {*anchors}:
+            continue
+        anchors_m = [centres_m[anchor] for anchor in anchors]
+        lookalikes_m = [centres_m[name] for name in _alike(task, target) if name in centres_m]
+        if any(_is_at(anchors_m, xy_m) for xy_m in lookalikes_m):
+            return True
+    return False
+
+
+def _is_at(anchors_m: Sequence[Floats], xy_m: Floats) -> bool:
+    """Return whether a position is next to one thing, or between two things.
+
+    Args:
+        anchors_m: positions (2,) of the one or two things.
+        xy_m: the position (2,).
+    """
+    if len(anchors_m) == 1:
+        return bool(np.linalg.norm(xy_m - anchors_m[0]) <= NEXT_TO_M)
+    first_m, second_m = anchors_m
+    line = second_m - first_m
+    dx, dy = xy_m - first_m
+    along, across = np.array([dx * line[0] + dy * line[1], dx * line[1] - dy * line[0]]) / (line @ line)
+    return bool(BETWEEN <= along <= 1 - BETWEEN and abs(across) <= BETWEEN)

@@ -27,6 +27,10 @@ from pipeline.seeding import rng
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TESTED_SUITES
+from pipeline.types import Floats
+
+RANGE = r"\((\w+)\s*\(:target \w+\)\s*\(:ranges \(\s*\(([-\d. ]+)\)"
+"""A region of a BDDL file and its range: lowest x and y, highest x and y."""
 
 PICK, PLATE = "pick_up_the_", "_and_place_it_on_the_plate"
 BASKET = "_and_place_it_in_the_basket"
@@ -160,6 +164,24 @@ def test_levels_are_distances_between_what_both_tasks_take() -> None:
     assert level(butter, soup) == 2
 
 
+UNCLEAR = (
+    f"{PICK}black_bowl_next_to_the_ramekin{PLATE}",
+    f"{PICK}black_bowl_between_the_plate_and_the_ramekin{PLATE}",
+)
+"""Task and scene of the only pair whose scene has two bowls in the place that the instruction names."""
+
+
+def test_both_bowls_of_the_pair_that_plans_leave_out_stand_next_to_the_ramekin() -> None:
+    """Their ranges are read in LIBERO's file by a pattern, without the parser."""
+    text = find_task("libero_spatial", UNCLEAR[1]).bddl_file.read_text()
+    middles: dict[str, Floats] = {}
+    for name, numbers in re.findall(RANGE, text):
+        low_x, low_y, high_x, high_y = map(float, numbers.split())
+        middles[name] = np.array([low_x + high_x, low_y + high_y]) / 2
+    for bowl in ("next_to_ramekin_region", "between_plate_ramekin_region"):
+        assert np.linalg.norm(middles[bowl] - middles["ramekin_region"]) < 0.17, "LIBERO's own are 0.12 to 0.13 m apart"
+
+
 def test_held_out_pairs_are_never_planned() -> None:
     axis = GoalAxis()
     for suite in SUITES:
@@ -168,7 +190,8 @@ def test_held_out_pairs_are_never_planned() -> None:
             planned |= {(task.name, scene) for scene in axis.entries(task)}
         held = {(task.name, scene.name) for task, scene in held_out(suite)}
         assert not planned & held
-        assert planned | held == {(pair.task.name, pair.scene.name) for pair in usable(suite)}
+        unclear = {UNCLEAR} if suite == "libero_spatial" else set()
+        assert planned | held == {(pair.task.name, pair.scene.name) for pair in usable(suite)} - unclear
 
 
 def test_starts_are_shared_by_all_tasks_of_a_scene() -> None:

@@ -1,4 +1,4 @@
-"""Checks of frames: equality with the stored frames, and views that show what their camera saw."""
+"""Checks of frames: equality with the stored frames, and views with the picture of their own camera."""
 
 from collections.abc import Callable, Iterator
 
