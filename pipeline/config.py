@@ -25,7 +25,7 @@ from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish_config import PublishConfig
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
-from pipeline.types import LONGEST_NAME, Count, Frozen, Place, RenderedExtra
+from pipeline.types import LONGEST_NAME, Count, Frozen, Place, RenderedExtra, find_home
 
 CHECKOUT = (
     *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),
@@ -109,7 +109,7 @@ class PlanConfig(Frozen):
         task_weights: Weight of ``<suite>/<task>`` in the distribution of episodes over the tasks; 1 by default.
     """
 
-    seed: int = Field(default=0, ge=-(2**63), lt=2**63)
+    seed: int = Field(default=0, strict=True, ge=-(2**63), lt=2**63)
     axes: Axes = Axes()
     episodes: dict[str, Count]
     reserve: float = Field(default=0.5, ge=0.0, le=10.0)
@@ -429,7 +429,8 @@ class Config(Frozen):
             nested = next((root / name for name in CHECKOUT if _nested(data, (root / name).resolve())), None)
             if nested or root.is_relative_to(data):
                 raise ValueError(f"folder: {data} overlaps with the folder {nested or root} of the checkout")
-        if Path.home().resolve().is_relative_to(data):
+        home = find_home()
+        if home is not None and home.resolve().is_relative_to(data):
             raise ValueError(f"folder: {data} is or contains the home folder")
         for shared in (texture_sources.FOLDER, object_sources.FOLDER, benchmark.FOLDER):
             if _nested(data, shared.resolve()):

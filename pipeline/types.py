@@ -48,13 +48,34 @@ class Frozen(BaseModel):
         return schema
 
 
-Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000)]
 """A number of files or episodes. Numbers above the limit would fill the memory before any message appears."""
 
 LONGEST_NAME = 60
 """Largest length of a name in paths. A path may join several names; file systems limit a name to 255 bytes."""
 
-Place = Annotated[Path, AfterValidator(Path.expanduser)]
+
+def _expand_home(path: Path) -> Path:
+    """Replace ``~`` by the home folder.
+
+    Raises:
+        ValueError: if the system knows no home folder of the user.
+    """
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        raise ValueError("the home folder of ~ is unknown here; write the whole path") from error
+
+
+def find_home() -> Path | None:
+    """Return the home folder; `None` if the system knows none, as in a container with an unnamed user."""
+    try:
+        return Path.home()
+    except RuntimeError:
+        return None
+
+
+Place = Annotated[Path, AfterValidator(_expand_home)]
 """A path of a configuration; ``~`` is the home folder, as in a shell."""
 
 

@@ -26,6 +26,7 @@ from pipeline.errors import PipelineError
 from pipeline.export_config import Where
 from pipeline.field_tables import with_tables
 from pipeline.libero.assets import libero_folder
+from pipeline.run.claim import find_missing_parent
 from pipeline.run.inputs import settings_of
 
 STARTER = REPOSITORY / "configs" / "starter.yaml"
@@ -404,6 +405,33 @@ def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest
     assert isinstance(source, Folder)
     found = [config.folder, config.demos.root, language.bank, source.folder]
     assert found == [tmp_path / name for name in ("runs", "d", "bank.yaml", "own")]
+
+
+@pytest.mark.parametrize("fields", ["plan: {episodes: {camera: true}}", "plan: {seed: true, episodes: {camera: 1}}"])
+def test_true_is_no_number(fields: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"name: mine\n{fields}")
+    with pytest.raises(PipelineError, match=r"plan\.(episodes\.camera|seed): expected a whole number, got True"):
+        load(file)
+
+
+@pytest.mark.parametrize("fields", ["folder: ~nobody_here/runs", "demos: {root: ~nobody_here/demos}"])
+def test_an_unknown_home_folder_is_named(fields: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"name: mine\n{fields}\nplan: {{episodes: {{camera: 1}}}}")
+    with pytest.raises(PipelineError, match=r"(folder|demos\.root): the home folder of ~ is unknown here"):
+        load(file)
+
+
+def test_a_user_without_a_home_folder_reads_a_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container that runs under a number. Python reports it by this error."""
+
+    def without_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", without_home)
+    assert load(REPOSITORY / "configs" / "starter.yaml").name == "starter"
+    assert find_missing_parent(Path("/nowhere/runs")) == Path("/nowhere")
 
 
 @pytest.mark.parametrize(

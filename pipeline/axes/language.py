@@ -226,12 +226,20 @@ def read_bank(file: Path) -> Bank:
         content = yaml.load(file.read_text(encoding="ascii"), FastStrictLoader) or {}
         return TypeAdapter(Bank).validate_python(content)
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
+        # Of a file with other content, every entry is a fault.
+        fault = _first_fault(error) if isinstance(error, ValidationError) else error
         raise PipelineError(
-            f"the file is not a bank of rewrites ({error})",
+            f"the file is not a bank of rewrites ({fault})",
             where=file,
             expected=f"ASCII YAML: suite, task name, class ({', '.join(CLASSES)}), list of sentences",
             remedy="correct or restore the file, or generate it again with the command rewrite",
         ) from error
+
+
+def _first_fault(error: ValidationError) -> str:
+    """Describe the first fault of a bank with its place."""
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
 
 
 def load_further_bank(file: Path) -> Bank:
@@ -251,7 +259,7 @@ def load_further_bank(file: Path) -> Bank:
                     f"the bank has rewrites of an unknown task ({error.what})",
                     where=file,
                     expected=error.expected,
-                    remedy="correct the name of the suite or of the task, or delete the rewrites",
+                    remedy="correct the name of the suite or of the task",
                 ) from error
     return bank
 

@@ -29,7 +29,7 @@ LENGTH = (
     f"at least {MIN_WORDS} words, at most {MAX_WORDS_AND_MARKS} words and punctuation marks together, "
     f"and at most {MAX_CHARACTERS} characters"
 )
-REMEDY = "correct or delete the sentence; or, if it is correct, add its words to axes/language_words.yaml"
+REMEDY = "correct the sentence; or, if it is correct, add its words to axes/language_words.yaml"
 
 _PREAMBLE = re.compile(
     r"^(sure|certainly|of course)\b\W*here\b"

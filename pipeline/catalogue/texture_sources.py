@@ -60,7 +60,7 @@ LICENCES = {
 LARGEST_PX = 64_000_000
 """Largest number of pixels of an image: 8,000 pixels square."""
 
-REPLACE = "replace the file, or move it away"
+REPLACE = "move the file to another place"
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 

@@ -191,8 +191,8 @@ def rewrite(bddl_file: Path, out: Path, per_class: int, endpoint: str, model: st
     The bank is the YAML file of --out, which plan.axes.language.bank of a configuration then names. An
     OpenAI-compatible endpoint generates rewrites of each class (distraction, common sense, reasoning chain,
     paraphrase) until the bank has enough of each class. A rewrite must pass the same checks as the shipped bank. The
-    bank is written again with each accepted rewrite: only comments at its beginning are kept. A stopped command resumes
-    when it is called again. The key of the endpoint is read from OPENAI_API_KEY.
+    bank is written again with each accepted rewrite, and may have comments only at its beginning. A stopped command
+    resumes when it is called again. The key of the endpoint is read from OPENAI_API_KEY.
     """
     from pipeline.rewriting.language_model import LanguageModel
     from pipeline.rewriting.rewrite import extend

@@ -100,6 +100,7 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     """
     task_brief = brief(bddl_file)
     bank = read_bank(out) if out.exists() else {}
+    reject_lost_comments(out)
     task: Task = task_brief["task"]
     stored = _stored(bank, task)
     _check_stored(stored, task, out)
@@ -237,8 +238,30 @@ def _add(accepted: Sequence[str], component: Component, task: Task, path: Path) 
 
 
 def _write(bank: Bank, path: Path) -> None:
-    """Replace the bank in ``path``, except the comments at its beginning."""
-    lines = path.read_text(encoding="ascii").splitlines(keepends=True) if path.exists() else []
-    head = "".join(takewhile(lambda line: line.startswith("#"), lines))
+    """Replace the bank in ``path``, or in the file that it links to, except the comments at its beginning."""
+    head, _ = _split(path)
     plain = TypeAdapter(Bank).dump_python(bank, mode="json")
-    write(path, head + yaml.safe_dump(plain, sort_keys=False, width=10_000))
+    write(path.resolve(), head + yaml.safe_dump(plain, sort_keys=False, width=10_000))
+
+
+def reject_lost_comments(path: Path) -> None:
+    """Reject a bank with comments that ``rewrite`` would lose: all but those at its beginning.
+
+    Raises:
+        PipelineError: naming the file.
+    """
+    _, entries = _split(path)
+    if any("#" in line for line in entries.splitlines()):
+        raise PipelineError(
+            "the bank has comments between its rewrites, which would be lost",
+            where=path,
+            expected="comments only at the beginning of the file",
+            remedy="move the comments to the beginning of the file, or write the rewrites into a new file",
+        )
+
+
+def _split(path: Path) -> tuple[str, str]:
+    """Return the comments and empty lines at the beginning of a bank, and the other lines."""
+    lines = path.read_text(encoding="ascii").splitlines(keepends=True) if path.exists() else []
+    head = [*takewhile(lambda line: line.startswith("#") or not line.strip(), lines)]
+    return "".join(head), "".join(lines[len(head) :])

@@ -15,6 +15,7 @@ from pipeline.files import is_temporary, read_json, remove_leftovers, write_json
 from pipeline.run.run import Run
 from pipeline.seeding import digest
 from pipeline.strict_yaml import StrictLoader
+from pipeline.types import find_home
 
 OWNER = "configuration.json"
 """Mark of a run's folder: a file that states the configuration file of the folder."""
@@ -191,7 +192,8 @@ def find_missing_parent(folder: Path) -> Path | None:
 
     With a mistyped path, a run would fill the disk of the system.
     """
-    is_elsewhere = folder.is_absolute() and not folder.is_relative_to(Path.home())
+    home = find_home()
+    is_elsewhere = folder.is_absolute() and (home is None or not folder.is_relative_to(home))
     return folder.parent if is_elsewhere and not folder.parent.exists() else None
 
 

@@ -18,6 +18,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from pipeline import outputs
 from pipeline.axes import Axes
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
@@ -84,12 +85,14 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
         rows: plan of ``candidates`` or ``resets`` for the same ``per_task``.
 
     Raises:
-        PipelineError: when a demonstration cannot be read, finished replays would be generated again or expanded
-            demonstrations be deleted without permission, or a file of other demonstrations would be replaced.
+        PipelineError: when a demonstration cannot be read, or finished replays would be generated again without
+            permission. Also when a file would be replaced that is edited or has other demonstrations, and without
+            permission, when expanded demonstrations would be deleted.
     """
     file_of = {entry.task: hdf5.demo_file(out, entry.task) for entry in demos.index().entries}
     for file in file_of.values():
         _reject_other_demonstrations(file)
+        outputs.reject_other_file(file)
     store = TrajectoryStore(out / ".replays")
     reject_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     faults: dict[str, str] = {}
@@ -112,7 +115,8 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
         if len(rows_of_task) < per_task:
             result.short[str(task)] = per_task - len(rows_of_task)
         if rows_of_task:
-            hdf5.write(file, task, (_recording(store.load(row.trajectory_id), row) for row in rows_of_task))
+            with outputs.written(file) as temporary:
+                hdf5.write(temporary, task, (_recording(store.load(row.trajectory_id), row) for row in rows_of_task))
             result.files.append(file)
             result.written += len(rows_of_task)
         else:

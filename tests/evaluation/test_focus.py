@@ -161,8 +161,8 @@ def test_every_floor_and_cap_is_kept(limits: Limits) -> None:
 @pytest.mark.parametrize(
     ("results", "episodes", "message"),
     [
-        (attempt("pose", 5, 10), None, "about an axis and a task of the plan, but about pose"),
-        (attempt("", 5, 10), None, "but about no axis"),
+        (attempt("pose", 5, 10), None, "axis and a task of the plan; the axes of the results: pose"),
+        (attempt("", 5, 10), None, "the axes of the results: no axis"),
         (attempt("camera", 5, 10), 2, "2 episodes for 3 entries"),
     ],
 )

@@ -289,6 +289,17 @@ def test_a_run_that_stopped_goes_on(server: Server, tmp_path: Path) -> None:
     assert len(server.asked) == asked
 
 
+def test_comments_at_the_beginning_and_a_link_stay(server: Server, tmp_path: Path) -> None:
+    server.replies = lists(1, 1, 1, 1)
+    bank, link = tmp_path / "bank.yaml", tmp_path / "link.yaml"
+    bank.write_text("# Mine.\n\n# Second block.\n{}\n")
+    link.symlink_to(bank.name)
+    rewrite.extend(STOVE.bddl_file, link, 1, ask(server))
+    assert link.is_symlink()
+    assert bank.read_text().startswith("# Mine.\n\n# Second block.\nlibero_goal:\n")
+    assert counts(bank) == [1, 1, 1, 1]
+
+
 def test_rewrites_that_were_stored_during_an_answer_stay(server: Server, tmp_path: Path) -> None:
     bank = tmp_path / "bank.yaml"
     model = ask(server)
@@ -395,6 +406,8 @@ def test_a_file_that_is_no_task_is_rejected(tmp_path: Path, text: str | None, fa
         ("- a list", "not a bank"),
         ("{libero_goal: {turn_on_the_stove: {riddle: [what gets hot]}}}", "not a bank"),
         ("{libero_goal: {turn_on_the_stove: {paraphrase: [stove_1 on]}}}", "stove_1 on.*file-name debris"),
+        ("# mine\n\nlibero_goal: {} # checked\n", "comments between its rewrites, which would be lost"),
+        ("name: mine\nplan: {episodes: {camera: 1}}", r"bank of rewrites \(name: [^\n]*\)\n"),
     ],
 )
 def test_a_bank_that_is_none_is_left_alone(server: Server, tmp_path: Path, text: str, fault: str) -> None:

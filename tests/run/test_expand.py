@@ -15,6 +15,7 @@ from conftest import STOVE, link_testset, starter_demo
 from machine_paths import told
 from scipy.spatial.transform import Rotation
 
+from pipeline import outputs
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop, runner
 from pipeline.compute_config import ComputeConfig
@@ -212,7 +213,8 @@ def test_only_what_an_expansion_made_is_replaced_and_only_if_that_is_allowed(
     file = tmp_path / STOVE.suite / f"{STOVE.name}_demo.hdf5"
     demo = starter_demo(STOVE)
     states = np.tile(demo.init_state, (len(demo.actions), 1))
-    hdf5.write(file, STOVE, [hdf5.Recording(demo.actions, states, states[:, :9], "<mujoco/>", {}, attrs)])
+    with outputs.written(file) as temporary:
+        hdf5.write(temporary, STOVE, [hdf5.Recording(demo.actions, states, states[:, :9], "<mujoco/>", {}, attrs)])
     before = file.read_bytes()
     if hdf5.EXPANDED_BY in attrs:
         with pytest.raises(PipelineError, match="1 demonstrations of an earlier expansion would be deleted"):
@@ -225,6 +227,17 @@ def test_only_what_an_expansion_made_is_replaced_and_only_if_that_is_allowed(
         with pytest.raises(PipelineError, match="that no expansion generated"):
             expand(tmp_path, TASKS, [], 1, loop)
         assert file.read_bytes() == before
+
+
+def test_an_edited_file_of_an_expansion_stays(expanded: tuple[Path, Expansion], tmp_path: Path) -> None:
+    folder = shutil.copytree(expanded[0], tmp_path / "expanded")
+    (file,) = folder.rglob("*.hdf5")
+    with h5py.File(file, "a") as content:
+        content["data/demo_0/obs/my_force_n"] = np.arange(10)
+    before = file.read_bytes()
+    with pytest.raises(PipelineError, match="the command would overwrite the file, which is edited"):
+        expand(folder, TASKS, [], 1, loop)
+    assert file.read_bytes() == before
 
 
 def test_a_file_without_demonstrations_is_not_taken_for_an_expansion(tmp_path: Path) -> None:

@@ -215,8 +215,7 @@ def focus(config: Config, results: Sequence[Attempt], episodes: int | None, limi
     if not by_axes.keys() - {""}:
         about = ", ".join(sorted({axis for attempt in results for axis in attempt.axes})) or "no axis"
         raise PipelineError(
-            f"no result is about an axis and a task of the plan, but about {about}",
-            where="PATH",
+            f"no result is about an axis and a task of the plan; the axes of the results: {about}",
             expected=f"results on {', '.join(axes)}, on tasks that demos.tasks selects",
             remedy="evaluate the policy on --source libero_plus, own or goals",
         )
