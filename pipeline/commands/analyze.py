@@ -139,7 +139,7 @@ def gap(results: Path) -> None:
     reject_other_file(findings)
     measured = composition.pairs(stored([results]))
     composition.heatmap(measured, picture)
-    figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
+    figures = {f"{pair.first}+{pair.second}": pair.figures() for pair in measured}
     write_json(findings, figures)
     print(json.dumps(figures))
 

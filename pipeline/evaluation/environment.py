@@ -259,17 +259,17 @@ class EpisodeEnvironment:
         Raises:
             PipelineError: if the action is not seven finite numbers, or if no episode is running.
         """
-        given, *others = checked_actions(action, "action").copy()
-        if others:
+        command, *further_commands = checked_actions(action, "action").copy()
+        if further_commands:
             raise PipelineError("step got several actions", expected="one action, (7,)")
         if self.progress.over:
             raise PipelineError("no episode is running", expected="reset before step, and no step after its end")
         episode = self.episode
-        given[6] = -1.0 if given[6] < 0 else 1.0
+        command[6] = -1.0 if command[6] < 0 else 1.0
         steps = episode.progress.steps + 1
         episode.frames = {}
         try:
-            self.simulator.step(given, absolute=self.settings.actions == "absolute")
+            self.simulator.step(command, absolute=self.settings.actions == "absolute")
             limited = "step_limit" if steps >= episode.step_limit else "running"
             episode.progress = Progress(steps, "success" if self.simulator.succeeded() else limited)
         except RejectedError as error:

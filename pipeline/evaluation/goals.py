@@ -80,9 +80,9 @@ def list_replacements(task: Task) -> tuple[Replacement, ...]:
     this kind. It also fits if it is no larger than an object that one of these tasks puts there.
     """
     scene = bddl.read(task.bddl_file)
-    named: set[str] = set()
+    goal_names: set[str] = set()
     for fact in scene.goal:
-        named |= set(fact)
+        goal_names |= set(fact)
     carrying = {place for thing, place in scene.places.items() if thing in scene.objects}
     categories = list(scene.objects.values())
     target_categories = [scene.objects[target] for target in scene.targets]
@@ -92,7 +92,7 @@ def list_replacements(task: Task) -> tuple[Replacement, ...]:
             continue  # "both moka pots" has no words for one of them
         relation, place = next((fact[0], fact[2]) for fact in scene.goal if fact[1] == old)
         neighbours = scene.neighbours(place)
-        taken = {*scene.receptacles, *carrying, *named, *(neighbours.things if neighbours else ())}
+        taken = {*scene.receptacles, *carrying, *goal_names, *(neighbours.things if neighbours else ())}
         for new, category in scene.objects.items():
             if new in taken or categories.count(category) > 1 or not _fits(category, relation, place, scene):
                 continue
@@ -120,20 +120,20 @@ def find_replacement(task: Task, name: str) -> Replacement:
     Raises:
         PipelineError: if the task has no such replacement.
     """
-    named: dict[str, Replacement] = {}
+    replacement_of_goal: dict[str, Replacement] = {}
     for replacement in list_replacements(task):
         goal = replacement.name(task, 0).rpartition("_")[0]
-        named[goal] = replacement
+        replacement_of_goal[goal] = replacement
     asked = name.rpartition("_")[0]
-    if asked not in named:
-        goals = " or ".join(named) or "a task with other objects"
+    if asked not in replacement_of_goal:
+        goals = " or ".join(replacement_of_goal) or "a task with other objects"
         raise PipelineError(
             f"{task.suite} has no goal {asked!r}",
             where=f"goals/{task.suite}/{name}",
             expected=goals,
             remedy="select the goals again with this version, or leave this task out",
         )
-    return named[asked]
+    return replacement_of_goal[asked]
 
 
 def _fits(category: str, relation: str, place: str, scene: Bddl) -> bool:
@@ -282,7 +282,7 @@ def resolve_goal(task: EvaluationTask) -> tuple[Task, Hashable]:
 def leave_out_trained_goals(wanted: list[EvaluationTask], plan: Path | None) -> list[EvaluationTask]:
     """Leave out goals that a training plan carries to the same scenes, and print their number."""
     goals = set() if plan is None else planned(plan).goals
-    left = [task for task in wanted if task.source != "goals" or resolve_goal(task)[1] not in goals]
-    if len(left) < len(wanted):
-        print(f"left out, because the plan trains on them: {len(wanted) - len(left)} of {len(wanted)} goals")
-    return left
+    kept = [task for task in wanted if task.source != "goals" or resolve_goal(task)[1] not in goals]
+    if len(kept) < len(wanted):
+        print(f"left out, because the plan trains on them: {len(wanted) - len(kept)} of {len(wanted)} goals")
+    return kept

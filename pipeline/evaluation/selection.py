@@ -77,20 +77,20 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
             archive.
     """
     _check_names(selection)
-    listed = list(_listed(selection))
+    source_tasks = list(_list_source_tasks(selection))
     if selection.source == "pairs":
         # Pairs are already restricted by axis and level. They include LIBERO's tasks, which have neither.
         selection = selection.model_copy(update={"axes": (), "levels": ()})
-    _check_listed(selection, listed)
-    wanted = [task for task in listed if _matches(task, selection)]
-    unknown = _of_unknown_level(listed, selection)
+    _check_restrictions(selection, source_tasks)
+    wanted = [task for task in source_tasks if _matches(task, selection)]
+    unknown = _count_unknown_levels(source_tasks, selection)
     if unknown:
         counts = ", ".join(f"{axis} {count}" for axis, count in unknown.items())
         print(f"left out, because their parameters do not state their level (0): {counts}")
     if selection.source == "libero_plus" and selection.file is None:
-        wanted = _runnable(wanted, selection, archive)
+        wanted = _select_runnable(wanted, selection, archive)
     if not wanted:
-        raise _nothing_left(selection, listed)
+        raise _nothing_left(selection, source_tasks)
     return wanted if selection.subset is None else balanced(wanted, selection.subset, selection.seed)
 
 
@@ -163,15 +163,15 @@ def _check_known(field: str, named: Iterable[object], valid: Collection[object],
         )
 
 
-def _listed(selection: Selection) -> Iterator[EvaluationTask]:
+def _list_source_tasks(selection: Selection) -> Iterator[EvaluationTask]:
     """Yield the tasks of the selection's source, before the other fields restrict them."""
     if selection.file is not None:
         yield from read_tasks(selection.file, selection.seed)
         return
     if selection.source == "libero_plus":
         for test in load().tasks:
-            named = test.suite, test.base, test.name
-            yield EvaluationTask("libero_plus", *named, test.axis, test.component, level_of_test(test), 0)
+            names = test.suite, test.base, test.name
+            yield EvaluationTask("libero_plus", *names, test.axis, test.component, level_of_test(test), 0)
         return
     numbered_tasks: list[tuple[int, Task]] = []
     for suite in selection.suites:
@@ -191,10 +191,10 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
                     sampled = (held_out_task(task, axis, level, number, selection.seed) for axis, level in kinds)
                     yield from filter(None, sampled)
                 case "pairs":
-                    yield from _pairs(task, place + number, number, selection)
+                    yield from _list_pairs(task, place + number, number, selection)
 
 
-def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator[EvaluationTask]:
+def _list_pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator[EvaluationTask]:
     """Yield all combinations of no axis, one axis and two axes on one initial state, at one level.
 
     Args:
@@ -212,55 +212,59 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
     """Return whether a task matches the names and the other restrictions of a selection."""
-    named = not selection.tasks or any(fnmatch.filter(_names(task, pattern), pattern) for pattern in selection.tasks)
-    asked = {column: getattr(selection, field) for field, column in COLUMNS.items()}
-    return named and all(not values or getattr(task, column) in values for column, values in asked.items())
+    name_matches = not selection.tasks or any(
+        fnmatch.filter(_collect_names(task, pattern), pattern) for pattern in selection.tasks
+    )
+    restrictions = {column: getattr(selection, field) for field, column in COLUMNS.items()}
+    return name_matches and all(
+        not values or getattr(task, column) in values for column, values in restrictions.items()
+    )
 
 
-def _names(task: EvaluationTask, pattern: str) -> set[str]:
+def _collect_names(task: EvaluationTask, pattern: str) -> set[str]:
     """Return the names of a task and its LIBERO task, after the suite if the pattern has a slash."""
     suite = f"{task.suite}/" if "/" in pattern else ""
     return {suite + task.name, suite + task.base}
 
 
-def _of_unknown_level(listed: Sequence[EvaluationTask], selection: Selection) -> Counter[str]:
+def _count_unknown_levels(source_tasks: Sequence[EvaluationTask], selection: Selection) -> Counter[str]:
     """Count, for each axis, the perturbed tasks with an unknown level that match apart from their level."""
     if not selection.levels or 0 in selection.levels:
         return Counter()
     at_any = selection.model_copy(update={"levels": ()})
-    unknown = (task for task in listed if task.level == 0 and task.axis != "clean")
+    unknown = (task for task in source_tasks if task.level == 0 and task.axis != "clean")
     return Counter(task.axis for task in unknown if _matches(task, at_any))
 
 
-def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
+def _check_restrictions(selection: Selection, source_tasks: Sequence[EvaluationTask]) -> None:
     """Reject restrictions that no listed task has.
 
     Raises:
         PipelineError: if an axis, a component, a level or a pattern of names matches no task.
     """
     for field in ("axes", "components", "levels"):
-        values = {getattr(task, COLUMNS[field]) for task in listed}
+        values = {getattr(task, COLUMNS[field]) for task in source_tasks}
         _check_known(field, getattr(selection, field), values, selection)
     if not selection.tasks:
         return
     # A faulty file of another suite of the user must not stop the evaluation.
-    known = [*chain.from_iterable(map(tasks, {*SUITES, *selection.suites}))]
+    all_tasks = [*chain.from_iterable(map(tasks, {*SUITES, *selection.suites}))]
     for pattern in selection.tasks:
-        names = {str(task) if "/" in pattern else task.name for task in known}
-        for task in listed:
-            names |= _names(task, pattern)
+        names = {str(task) if "/" in pattern else task.name for task in all_tasks}
+        for task in source_tasks:
+            names |= _collect_names(task, pattern)
         if not fnmatch.filter(names, pattern):
             closest = difflib.get_close_matches(pattern, names, cutoff=0)
             raise PipelineError(f"no task is named {pattern!r}", where="tasks", expected=" or ".join(closest))
 
 
-def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> PipelineError:
+def _nothing_left(selection: Selection, source_tasks: Sequence[EvaluationTask]) -> PipelineError:
     """Return an error that lists, for each restriction, the values that would still match the other restrictions."""
     alternatives: list[str] = []
     for field, column in COLUMNS.items():
         if getattr(selection, field):
             without_field = selection.model_copy(update={field: ()})
-            values = {getattr(task, column) for task in listed if _matches(task, without_field)}
+            values = {getattr(task, column) for task in source_tasks if _matches(task, without_field)}
             if values:
                 names = " or ".join(str(value) for value in sorted(values))
                 alternatives.append(f"{field} {names}")
@@ -271,16 +275,16 @@ def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> Pip
     )
 
 
-def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
+def _select_runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
     """Return the tasks that can be rebuilt here, and print how many cannot.
 
     Raises:
         PipelineError: if no task can be rebuilt, or no task of an axis that the selection names.
     """
-    left = [task for task in wanted if libero_plus.assets_of(load().find(task.suite, task.name), archive)]
-    missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
+    runnable = [task for task in wanted if libero_plus.assets_of(load().find(task.suite, task.name), archive)]
+    missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in runnable)
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
-    if missing and (not left or {*selection.axes} - {task.axis for task in left}):
+    if missing and (not runnable or {*selection.axes} - {task.axis for task in runnable}):
         raise PipelineError(
             f"{counts} of {len(wanted)} tasks need files of LIBERO-Plus's asset archive",
             where="axes" if archive is None else archive,
@@ -290,4 +294,4 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
         )
     if missing:
         print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")
-    return left
+    return runnable

@@ -29,7 +29,7 @@ def some_pairs(**fields: Any) -> list[EvaluationTask]:
 
 
 def test_the_gap_is_as_worked_by_hand() -> None:
-    pair = AxisPair("robot", "camera", trials=100, neither=90, only_one=60, only_other=50, both=20)
+    pair = AxisPair("robot", "camera", trials=100, neither=90, only_first=60, only_second=50, both=20)
     # 220 successes: the joint probability is 20 / 220, the marginal ones are 80 / 220 and 70 / 220.
     assert pair.joint == pytest.approx(1 / 11)
     assert pair.product == pytest.approx(80 * 70 / 220**2)
@@ -84,7 +84,7 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
         EpisodeFiles(tmp_path).save(result(task, success, **ended))
     assert analyze("gap", str(tmp_path)) == 0
     (pair,) = composition.pairs(stored([tmp_path]))
-    assert replace(pair, interval=None) == AxisPair("robot", "noise", 2, neither=2, only_one=0, only_other=1, both=0)
+    assert replace(pair, interval=None) == AxisPair("robot", "noise", 2, neither=2, only_first=0, only_second=1, both=0)
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert printed["robot+noise"]["trials"] == 2
     assert printed["robot+noise"]["bootstrap"]["resampled"] == "2 trials"

@@ -48,22 +48,22 @@ class AxisPair:
     """Pair of axes, and the successes of their four combinations.
 
     Attributes:
-        one: the first axis.
-        other: the second axis.
+        first: the first axis.
+        second: the second axis.
         trials: number of episodes of each combination; all combinations share tasks, initial states and perturbations.
         neither: successes without a perturbation.
-        only_one: successes with the first axis alone.
-        only_other: successes with the second axis alone.
+        only_first: successes with the first axis alone.
+        only_second: successes with the second axis alone.
         both: successes with both axes.
         interval: interval of the gap, by bootstrap over trials; `None` if only the counts are known.
     """
 
-    one: str
-    other: str
+    first: str
+    second: str
     trials: int
     neither: int
-    only_one: int
-    only_other: int
+    only_first: int
+    only_second: int
     both: int
     interval: Interval | None = None
 
@@ -85,7 +85,7 @@ class AxisPair:
     @property
     def _sums(self) -> Floats:
         """Return the (1, 4) successes as ``gap`` takes them."""
-        return np.array([[self.neither, self.only_one, self.only_other, self.both]], float)
+        return np.array([[self.neither, self.only_first, self.only_second, self.both]], float)
 
     def chi_square(self) -> tuple[float, float]:
         """Return the statistic and the p-value of the paper's test.
@@ -94,7 +94,7 @@ class AxisPair:
         correction for continuity. The p-value is the probability of a statistic as large or larger if D_i and D_j were
         independent. Both numbers are NaN if the test is not defined.
         """
-        table = np.array([[self.neither, self.only_other], [self.only_one, self.both]])
+        table = np.array([[self.neither, self.only_second], [self.only_first, self.both]])
         if not (table.any(axis=0).all() and table.any(axis=1).all()):
             return float("nan"), float("nan")
         tested = chi2_contingency(table, correction=False)
@@ -103,7 +103,7 @@ class AxisPair:
     def figures(self) -> dict[str, Any]:
         """Return all figures of the pair, JSON-serialisable; undefined numbers are `None`."""
         statistic, p_value = self.chi_square()
-        counts = {"neither": self.neither, "one": self.only_one, "other": self.only_other, "both": self.both}
+        counts = {"neither": self.neither, "one": self.only_first, "other": self.only_second, "both": self.both}
         return {
             "trials": self.trials,
             "successes": counts,
@@ -218,11 +218,11 @@ def matrix(measured: Sequence[AxisPair]) -> tuple[list[str], Floats]:
     """
     axes: list[str] = []
     for pair in measured:
-        axes += [pair.one, pair.other]
+        axes += [pair.first, pair.second]
     names = _in_order(axes)
     probabilities = np.full((len(names), len(names)), np.nan)
     for pair in measured:
-        row, column = names.index(pair.one), names.index(pair.other)
+        row, column = names.index(pair.first), names.index(pair.second)
         probabilities[row, column], probabilities[column, row] = pair.product, pair.joint
     return names, probabilities
 

@@ -82,18 +82,18 @@ def construct(
         if row.reason == REJECTED:
             rejected.add(str(row))
     accepted = [task for task in sampled if str(task) not in rejected]
-    apart = accepted
+    not_overlapping = accepted
     if plan is not None:
-        apart = [
+        not_overlapping = [
             task
             for task in accepted
             if not plan.overlap(sample_perturbation(task, seed), find_task(task.suite, task.base))
         ]
-    chosen = balanced(apart, size, seed)
+    chosen = balanced(not_overlapping, size, seed)
     return chosen, {
         "candidates": len(sampled),
         "refused": len(sampled) - len(accepted),
-        "overlapping": len(accepted) - len(apart),
+        "overlapping": len(accepted) - len(not_overlapping),
         "tasks": len(chosen),
         "by_axis": dict(sorted(Counter(task.axis for task in chosen).items())),
         "by_component": dict(sorted(Counter(f"{task.axis}/{task.component}" for task in chosen).items())),
