@@ -30,11 +30,11 @@ def progress_of(description: str, total: int) -> Iterator[Callable[[int], None]]
             progress.advance(task, size)
             done = int(state.completed)
             rate = done / max(state.elapsed or 0.0, 1e-9)
-            progress.update(task, rate=f"{rate:.2f}/s")
+            progress.update(task, rate=f"{rate:.3g}/s")
             due = int(10 * done / total) > tenths or time.monotonic() - printed_s >= SAID_EVERY_S
             if not console.is_terminal and due:
                 printed_s = time.monotonic()
                 left = (total - done) / rate
-                console.print(f"{description}: {done}/{total}, {rate:.2f}/s, {left:.0f} s left", highlight=False)
+                console.print(f"{description}: {done}/{total}, {rate:.3g}/s, {left:.0f} s left", highlight=False)
 
         yield advance
