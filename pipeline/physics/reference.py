@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
@@ -72,21 +72,20 @@ class Reference:
         places = _places(model, data)
         positions, matrices = np.empty((len(states), 3)), np.empty((len(states), 3, 3))
         poses = {name: np.empty((len(states), 7)) for name in objects}
-        partners = []
+        log = _ContactLog(model, poses, places, len(states))
         for step, state in enumerate(states):
             compiled.restore(state)
             positions[step], matrices[step] = grip_pose(data)
             for name in objects:
                 poses[name][step] = data.joint(f"{name}_joint0").qpos
-            partners.append(_partners(compiled))
-        contacts = _contacts(model, partners, poses, places)
+            log.note(step, _partners(compiled))
         return cls(
             positions_m=positions,
             rotations=Rotation.from_matrix(matrices),
             actions=actions,
             poses=poses,
             places=places,
-            **contacts._asdict(),
+            **log.masks()._asdict(),
         )
 
     def __len__(self) -> int:
@@ -123,62 +122,89 @@ class _Contacts(NamedTuple):
     met: Mapping[str, Mask]
 
 
-def _contacts(
-    model: mujoco.MjModel,
-    partners: Sequence[Mapping[int, set[int]]],
-    poses: Mapping[str, Floats],
-    places: Mapping[str, Floats],
-) -> _Contacts:
-    """Find the contacts of the hand and of the objects in it.
+class _ContactLog:
+    """Contacts of the hand and of the objects in it, noted state by state.
 
     Args:
         model: the scene's model.
-        partners: for each of the K+1 states, root body to the root bodies that it touches.
         poses: object to (K+1, 7), as in ``Reference``.
         places: fixture or region to its pose (7,), as in ``Reference``.
+        states: number K+1 of the states.
     """
-    steps, robot = len(partners), int(model.body("robot0_base").rootid[0])
-    # Look bodies up by the joint, because bodies of added objects follow another naming scheme.
-    object_of_body = {int(model.body_rootid[model.joint(f"{name}_joint0").bodyid[0]]): name for name in poses}
-    roots = _roots(model)
-    fixtures = [name for name in places if f"{name}_main" in roots]
-    fixture_of_body = {int(model.body(f"{name}_main").id): name for name in fixtures}
-    thing_of_body = object_of_body | fixture_of_body
-    regions = [name for name in places if name not in thing_of_body.values()]
-    busy, engaged = np.zeros(steps, bool), np.zeros(steps, bool)
-    held = {name: np.zeros(steps, bool) for name in poses}
-    carried = {name: np.zeros(steps, bool) for name in poses}
-    met = {name: np.zeros(steps, bool) for name in (*thing_of_body.values(), *regions)}
-    # Object to the bodies that it stood on until the hand took it: taking it does not meet them.
-    stood_on: dict[int, set[int]] = {body: set() for body in object_of_body}
-    last_held: dict[int, int] = {}
-    for step, touching in enumerate(partners):
-        for body in touching.get(robot, set()):
-            is_carried = body in object_of_body and touching[body] == {robot}
-            busy[step] |= not is_carried
-            engaged[step] |= not is_carried and body in thing_of_body
-            if body in thing_of_body:
-                masks = carried if is_carried else met
-                masks[thing_of_body[body]][step] = True
-        for body, name in object_of_body.items():
-            touched = touching.get(body, set())
-            if robot in touched:
-                held[name][step], last_held[body] = True, step
-            elif not held[name].any():
-                stood_on[body] |= touched
-                continue
-            elif step > last_held[body] + FALL:
-                continue
-            # Contacts of a released object count at the last step in the hand.
-            for touched_thing in (touched & thing_of_body.keys()) - stood_on[body]:
-                met[thing_of_body[touched_thing]][last_held[body]] = True
-            if touched - {robot}:
-                for region in regions:
-                    # The object's origin is over the region, or under it.
-                    away_m = np.abs(poses[name][step, :2] - places[region][:2])
-                    if (away_m < model.site(region).size[:2]).all():
-                        met[region][last_held[body]] = True
-    return _Contacts(busy, engaged, held, carried, met)
+
+    def __init__(
+        self, model: mujoco.MjModel, poses: Mapping[str, Floats], places: Mapping[str, Floats], states: int
+    ) -> None:
+        self._model, self._poses, self._places = model, poses, places
+        self._robot = int(model.body("robot0_base").rootid[0])
+        # Look bodies up by the joint, because bodies of added objects follow another naming scheme.
+        self._object_of_body = {int(model.body_rootid[model.joint(f"{name}_joint0").bodyid[0]]): name for name in poses}
+        roots = _roots(model)
+        fixtures = [name for name in places if f"{name}_main" in roots]
+        self._thing_of_body = self._object_of_body | {int(model.body(f"{name}_main").id): name for name in fixtures}
+        things = self._thing_of_body.values()
+        self._regions = [name for name in places if name not in things]
+        self._busy, self._engaged = np.zeros(states, bool), np.zeros(states, bool)
+        self._held = {name: np.zeros(states, bool) for name in poses}
+        self._carried = {name: np.zeros(states, bool) for name in poses}
+        self._met = {name: np.zeros(states, bool) for name in (*things, *self._regions)}
+        # Object to the bodies that it stood on until the hand took it: taking it does not meet them.
+        self._stood_on: dict[int, set[int]] = {body: set() for body in self._object_of_body}
+        self._last_held: dict[int, int] = {}
+
+    def note(self, step: int, partners: Mapping[int, set[int]]) -> None:
+        """Note the contacts of the next state.
+
+        Args:
+            step: number of the state.
+            partners: root body to the root bodies that it touches.
+        """
+        for body in partners.get(self._robot, set()):
+            self._note_hand(step, body, partners[body])
+        for body in self._object_of_body:
+            touched = partners.get(body, set())
+            if self._robot in touched:
+                self._held[self._object_of_body[body]][step] = True
+                self._last_held[body] = step
+            if body not in self._last_held:
+                self._stood_on[body] |= touched
+            elif step <= self._last_held[body] + FALL:
+                self._note_held(step, body, touched)
+
+    def _note_hand(self, step: int, body: int, touched: set[int]) -> None:
+        """Note that the robot touches ``body``, which touches the bodies ``touched``."""
+        if body in self._object_of_body and touched == {self._robot}:
+            self._carried[self._object_of_body[body]][step] = True
+            return
+        self._busy[step] = True
+        if body in self._thing_of_body:
+            self._engaged[step] = True
+            self._met[self._thing_of_body[body]][step] = True
+
+    def _note_held(self, step: int, body: int, touched: set[int]) -> None:
+        """Note the things that an object touches in the hand, or while it comes down after its release.
+
+        Contacts of a released object count at the last step in the hand.
+        """
+        last_held = self._last_held[body]
+        for thing in (touched & self._thing_of_body.keys()) - self._stood_on[body]:
+            self._met[self._thing_of_body[thing]][last_held] = True
+        if touched - {self._robot}:
+            for region in self._regions_at(self._poses[self._object_of_body[body]][step, :2]):
+                self._met[region][last_held] = True
+
+    def _regions_at(self, xy_m: Floats) -> list[str]:
+        """List the regions that are above or below an object's origin (2,)."""
+        regions = []
+        for region in self._regions:
+            away_m = np.abs(xy_m - self._places[region][:2])
+            if (away_m < self._model.site(region).size[:2]).all():
+                regions.append(region)
+        return regions
+
+    def masks(self) -> _Contacts:
+        """Return the masks of all noted states."""
+        return _Contacts(busy=self._busy, engaged=self._engaged, held=self._held, carried=self._carried, met=self._met)
 
 
 def _roots(model: mujoco.MjModel) -> set[str]:

@@ -113,6 +113,22 @@ def subtasks_by_contacts(
     return tuple(sequence)
 
 
+class _Words(NamedTuple):
+    """Descriptions of an object and of its place in the goal.
+
+    Attributes:
+        thing: the object.
+        thing_at_start: the object, with its place at the start if needed to distinguish it.
+        to: the place as a direction, such as "to the plate".
+        at: the place as a position, such as "on the plate".
+    """
+
+    thing: str
+    thing_at_start: str
+    to: str
+    at: str
+
+
 class _Seen:
     """Positions and contacts of a trajectory's K+1 states."""
 
@@ -120,7 +136,7 @@ class _Seen:
         self.model = model
         self.pairs = pairs
         self.qpos = np.stack([State.of(state, self.model.nq).qpos for state in trajectory.states])
-        self.closing = np.append(trajectory.actions[:, 6] > 0, False)
+        self.closing: Mask = np.append(trajectory.actions[:, 6] > 0, False)
         self.robot = self._below(self.model.body("robot0_base").id)
 
     def manipulations(self, problem: Bddl, fact: Fact) -> Iterator[_Manipulation]:
@@ -133,39 +149,48 @@ class _Seen:
     def _with_object(self, problem: Bddl, fact: Fact) -> Iterator[_Manipulation]:
         """Yield the manipulations of the fact's movable object: it is pushed, or grasped, moved and placed."""
         body = self._below(self.model.body(f"{fact[1]}_main").id)
+        gripped, resting = self._gripped(body), self._touch(body, ~body & ~self.robot)
+        first = int(self.model.joint(f"{fact[1]}_joint0").qposadr[0])
+        positions_m = self.qpos[:, first : first + 3]
+        words = _Words(called(problem, fact[1]), called_at_start(problem, fact[1]), *where(problem, fact))
+        for reached, left in _runs(self._touch(body, self.robot)):
+            moved_m = _distances(positions_m[reached : left + 1], positions_m[reached])
+            if moved_m.max() < MOVED_M:
+                continue
+            grips = reached + np.flatnonzero(gripped[reached:left])
+            slid_m = _distances(positions_m[grips], positions_m[grips[:1]])
+            lifted = grips[~resting[grips] | (slid_m >= LIFTED_M)]
+            heights_m = positions_m[reached : left + 1, 2]
+            if len(lifted):
+                subtasks = self._grasp_and_place(words, resting, int(lifted[0]), int(grips[-1]) + 1)
+            elif heights_m.max() - heights_m[0] < CARRIED_M:
+                subtasks = [Subtask(reached, f"push {words.thing_at_start} {words.to}")]
+            else:
+                subtasks = _move_with_another(words, reached, heights_m)
+            yield _Manipulation(reached, left, words.thing_at_start, tuple(subtasks))
+
+    def _gripped(self, body: Mask) -> Mask:
+        """Return a mask (K+1,) of the states in which both fingers touch a body while the gripper closes."""
         left_finger = self._below(self.model.body("gripper0_leftfinger").id)
         right_finger = self._below(self.model.body("gripper0_rightfinger").id)
-        gripped = self._touch(body, left_finger) & self._touch(body, right_finger) & self.closing
-        resting = self._touch(body, ~body & ~self.robot)
-        first = int(self.model.joint(f"{fact[1]}_joint0").qposadr[0])
-        place = self.qpos[:, first : first + 3]
-        thing, thing_at_start = called(problem, fact[1]), called_at_start(problem, fact[1])
-        to, at = where(problem, fact)
-        for reached, left in _runs(self._touch(body, self.robot)):
-            grips = np.flatnonzero(gripped[:left])
-            grips = grips[grips >= reached]
-            lifted = grips[~resting[grips] | (_distances(place[grips], place[grips[:1]]) >= LIFTED_M)]
-            if _distances(place[reached : left + 1], place[reached]).max() < MOVED_M:
-                continue
-            heights_m = place[reached : left + 1, 2]
-            if len(lifted):
-                grasp = np.flatnonzero(~self.closing[: lifted[0]]).max(initial=-1) + 1
-                placed = _put_down(resting, int(lifted[0]), int(grips[-1]) + 1)
-                subtasks = [
-                    Subtask(int(grasp), f"grasp {thing_at_start}"),
-                    Subtask(int(lifted[0]), f"move {thing} {to}"),
-                    Subtask(placed, f"place {thing} {at}"),
-                ]
-            elif heights_m.max() - heights_m[0] < CARRIED_M:
-                subtasks = [Subtask(reached, f"push {thing_at_start} {to}")]
-            else:
-                rising = reached + int(np.argmax(heights_m >= heights_m[0] + LIFTED_M))
-                subtasks = [Subtask(rising, f"move {thing} {to}")]
-                higher = np.flatnonzero(heights_m >= heights_m[-1] + LIFTED_M)
-                # The trajectory may end before the object comes down.
-                if len(higher):
-                    subtasks.append(Subtask(reached + int(higher[-1]) + 1, f"place {thing} {at}"))
-            yield _Manipulation(reached, left, thing_at_start, tuple(subtasks))
+        gripped: Mask = self._touch(body, left_finger) & self._touch(body, right_finger) & self.closing
+        return gripped
+
+    def _grasp_and_place(self, words: _Words, resting: Mask, lifted: int, release: int) -> list[Subtask]:
+        """Return the subtasks of a lifted object.
+
+        Args:
+            words: descriptions of the object and its place.
+            resting: (K+1,) True while the object touches anything other than the robot.
+            lifted: first step at which it is lifted.
+            release: step at which its last grip ends.
+        """
+        grasp = np.flatnonzero(~self.closing[:lifted]).max(initial=-1) + 1
+        return [
+            Subtask(int(grasp), f"grasp {words.thing_at_start}"),
+            Subtask(lifted, f"move {words.thing} {words.to}"),
+            Subtask(_put_down(resting, lifted, release), f"place {words.thing} {words.at}"),
+        ]
 
     def _with_part(self, problem: Bddl, fact: Fact) -> Iterator[_Manipulation]:
         """Yield the manipulations of the fact's drawer, door or knob: each turn of one of its joints."""
@@ -201,6 +226,17 @@ class _Seen:
     def _touch(self, first: Mask, second: Mask) -> Mask:
         """Return a mask (K+1,) of the states in which any body of ``first`` touches any body of ``second``."""
         return np.array([bool((first[pairs] & second[pairs[:, ::-1]]).any()) for pairs in self.pairs])
+
+
+def _move_with_another(words: _Words, reached: int, heights_m: Floats) -> list[Subtask]:
+    """Return the subtasks of an object that rises without a grip, from its heights while the robot touches it."""
+    rising = reached + int(np.argmax(heights_m >= heights_m[0] + LIFTED_M))
+    subtasks = [Subtask(rising, f"move {words.thing} {words.to}")]
+    higher = np.flatnonzero(heights_m >= heights_m[-1] + LIFTED_M)
+    # The trajectory may end before the object comes down.
+    if len(higher):
+        subtasks.append(Subtask(reached + int(higher[-1]) + 1, f"place {words.thing} {words.at}"))
+    return subtasks
 
 
 def _put_down(resting: Mask, lifted: int, release: int) -> int:
