@@ -29,7 +29,7 @@ def main() -> None:
     for stage in STAGES:
         running = subprocess.Popen([sys.executable, f"stages/{stage}.py", file])
         while running.poll() is None:
-            for folder, mb in folders_mb(config.data).items():
+            for folder, mb in folders_mb(config.run_folder).items():
                 largest[folder] = max(largest.get(folder, 0.0), mb)
             try:
                 running.wait(EVERY_S)
@@ -38,7 +38,7 @@ def main() -> None:
         if running.returncode:
             raise SystemExit(running.returncode)
     doctor = {folder: round(mb, 2) for folder, mb in needed_mb(config).items()}
-    print(json.dumps({"largest_mb": largest, "in_the_end_mb": folders_mb(config.data), "doctor_mb": doctor}))
+    print(json.dumps({"largest_mb": largest, "in_the_end_mb": folders_mb(config.run_folder), "doctor_mb": doctor}))
 
 
 def folders_mb(data: Path) -> dict[str, float]:

@@ -424,7 +424,7 @@ class Config(Frozen):
     @model_validator(mode="after")
     def _folder_of_its_own(self) -> Config:
         """Reject a folder in which stages would delete files that do not belong to the run."""
-        data = self.data.resolve()
+        data = self.run_folder.resolve()
         for root in {Path.cwd(), Path(__file__).resolve().parents[1]}:
             nested = next((root / name for name in CHECKOUT if _nested(data, (root / name).resolve())), None)
             if nested or root.is_relative_to(data):
@@ -440,7 +440,7 @@ class Config(Frozen):
         return self
 
     @property
-    def data(self) -> Path:
+    def run_folder(self) -> Path:
         """Folder of all files that this run generates."""
         return self.folder / self.name
 

@@ -37,7 +37,7 @@ def perform_stage(script: str) -> None:
     def work() -> int:
         reject_other_folder(arguments.config)
         config = claim_folder(arguments.config)
-        with locked(config.data):
+        with locked(config.run_folder):
             for name in names:
                 perform(name, Run(config))
         return 0

@@ -396,7 +396,7 @@ def run_all(file: Path) -> Run:
         PipelineError: when a stage stops, or another process works in the folder.
     """
     config = claim_folder(file)
-    with locked(config.data):
+    with locked(config.run_folder):
         for number, name in enumerate(STAGES, start=1):
             perform(name, Run(config), f"[{number}/{len(STAGES)}] {name}")
     return Run(config)

@@ -333,7 +333,7 @@ def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
     file.write_text(THREE_LINES)
     jsonschema.validate(yaml.safe_load(THREE_LINES), schemas()["config.schema.json"])
     config = load(file)
-    assert config.data == Path("data/mine")
+    assert config.run_folder == Path("data/mine")
     assert {name for name, axis in config.plan.axes if axis} == {"camera", "language"}
     assert (config.plan.reserve, config.replay.mode, config.demos.source) == (0.5, "auto", "starter")
     assert config.export.name == "libero_mine"
@@ -384,7 +384,7 @@ def test_a_folder_of_demonstrations_is_of_hdf5_files_and_one_format_is_enough(tm
     )
     config = load(file)
     assert config.demos.source == "hdf5"
-    assert config.data == Path("/big/disk/mine")
+    assert config.run_folder == Path("/big/disk/mine")
     assert list(config.export.formats) == ["rlds"]
     assert config.export.name == config.export.formats["rlds"].name == "libero_mine"
 

@@ -32,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="configuration of the run, with frames: images")
     config = load(parser.parse_args().data)
-    (root,) = (target.root for target in config.export.datasets(config.data) if target.name == "lerobot")
+    (root,) = (target.root for target in config.export.datasets(config.run_folder) if target.name == "lerobot")
     columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *KEYS.values()]
     table = pq.read_table(root / "data", columns=columns)
     environment = EpisodeEnvironment(EpisodeSettings(initial_states="demonstration"))

@@ -219,7 +219,7 @@ def test_the_arms_for_gpus_are_those_of_the_table(shipped: Experiment) -> None:
         for axes_of_mixture, count in run.plan.episodes.items():
             share = axes.run.plan.episodes[axes_of_mixture] / planned_perturbed(axes, arm)
             assert count == pytest.approx(2560 * share, abs=1)
-    assert len({run.demos.root for run in runs.values()}) == 1 < len({run.data for run in runs.values()})
+    assert len({run.demos.root for run in runs.values()}) == 1 < len({run.run_folder for run in runs.values()})
 
 
 @pytest.mark.parametrize(

@@ -60,15 +60,15 @@ def claim_folder(file: Path) -> Config:
     """
     config = load(file)
     _reject_other_owner(config, file)
-    config.data.mkdir(parents=True, exist_ok=True)
-    _reject_links(config.data)
+    config.run_folder.mkdir(parents=True, exist_ok=True)
+    _reject_links(config.run_folder)
     wanted = Mark(file.resolve(), _content(file))
-    if _mark(config.data) != wanted:
-        with locked(config.data):
+    if _mark(config.run_folder) != wanted:
+        with locked(config.run_folder):
             _reject_other_owner(config, file)  # Another stage may have claimed the folder in the meantime.
-            path = os.path.relpath(wanted.file, config.data.resolve())
+            path = os.path.relpath(wanted.file, config.run_folder.resolve())
             content = {"configuration": path, "name": config.name, "content": wanted.content}
-            write_json(config.data / OWNER, content)
+            write_json(config.run_folder / OWNER, content)
     return config
 
 
@@ -110,7 +110,7 @@ def open_run(file: Path) -> Run:
     """
     config = load(file)
     _reject_missing_parent(config, file)
-    if (config.data / OWNER).exists():
+    if (config.run_folder / OWNER).exists():
         _reject_other_owner(config, file)
     return Run(config)
 
@@ -210,7 +210,7 @@ def _reject_missing_parent(config: Config, file: Path) -> None:
 
 def _reject_other_owner(config: Config, file: Path) -> None:
     """Reject a folder that must not be given to a configuration file."""
-    folder = config.data
+    folder = config.run_folder
     _reject_missing_parent(config, file)
     reject_unmarked(folder)
     _reject_folder_in_run(folder)

@@ -28,7 +28,7 @@ class Run:
 
     def __init__(self, config: Config, folder: Path | None = None) -> None:
         self.config = config
-        self.folder = folder or config.data
+        self.folder = folder or config.run_folder
 
     def __reduce__(self) -> tuple[type["Run"], tuple[Config, Path]]:
         """Send only the configuration and the folder to a worker, which opens the stores itself."""

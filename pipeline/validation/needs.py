@@ -90,7 +90,7 @@ def needed_mb(config: Config) -> dict[str, float]:
         + amounts.steps * (poses_kb + MOTION_KB),
     }
     sizes = StepSizes(frame_kb, map_kb, poses_kb, MOTION_KB)
-    for dataset in config.export.datasets(config.data, content):
+    for dataset in config.export.datasets(config.run_folder, content):
         needed_kb[dataset.name] = steps * dataset.step_kb(sizes) + episodes * EPISODE_KB
     return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
 
@@ -130,7 +130,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
             rendered_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + maps_s * mapped)
             encoded_s += episodes * amounts.mean_steps * ENCODE_S * bool(here)
     processor = speed.step_s / REFERENCE.step_s
-    datasets = config.export.datasets(config.data, content)
+    datasets = config.export.datasets(config.run_folder, content)
     _, exported_steps = _exported(config, amounts)
     return {
         "replay": trajectories * replay_s(amounts.mean_steps, speed),

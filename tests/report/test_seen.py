@@ -184,7 +184,7 @@ def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:
     demos, wanted = {"tasks": [f"{MILK.suite}/{MILK.name}"]}, {"episodes": {"noise": 1}, "reserve": 0.0}
     config = Config.model_validate({"name": "seen", "folder": tmp_path, "demos": demos, "plan": wanted})
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
-    plan.write(rows, config.data / "plan.parquet")
+    plan.write(rows, config.run_folder / "plan.parquet")
     clean, lighter = (
         encode(np.full((256, 256, 3), level, np.uint8), config.render.jpeg_quality) for level in (100, 120)
     )
@@ -198,7 +198,7 @@ def test_noise_is_measured_in_the_view_that_it_changes(tmp_path: Path) -> None:
         geometry={one.geometry.stream_id: view for one in (*twins.values(), *noisy.values())},
         quality=Quality(**dict.fromkeys((each.name for each in fields(Quality)), 0)),
     )
-    FrameStore(config.data / "frames", config.render).save(rows[0].trajectory_id, rendered, "a GPU")
+    FrameStore(config.run_folder / "frames", config.render).save(rows[0].trajectory_id, rendered, "a GPU")
     ((_, levels),) = seen._Seen(Run(config), {rows[0].episode_id: rows[0]}).measure(rows[1])
     assert levels == pytest.approx(20, abs=1)
 

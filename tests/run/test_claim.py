@@ -99,7 +99,7 @@ def test_no_missing_disk_is_replaced_by_a_new_folder(clone: Path, tmp_path: Path
             use(file)
     assert not disk.exists()
     (disk / "me").mkdir(parents=True)
-    assert claim_folder(file).data == disk / "me" / "data" / "tiny"
+    assert claim_folder(file).run_folder == disk / "me" / "data" / "tiny"
 
 
 def edit(file: Path, **fields: object) -> None:
@@ -138,7 +138,7 @@ def test_a_checkout_that_was_moved_keeps_its_runs(edited: bool, clone: Path, mon
     if not edited:
         edit(checkout / file, folder=str(disk))
     monkeypatch.chdir(checkout)
-    finished = claim_folder(file).data / "trajectories" / "0123456789abcdef.h5"
+    finished = claim_folder(file).run_folder / "trajectories" / "0123456789abcdef.h5"
     finished.parent.mkdir()
     finished.write_bytes(b"hours of work")
     monkeypatch.chdir(clone)
@@ -146,7 +146,7 @@ def test_a_checkout_that_was_moved_keeps_its_runs(edited: bool, clone: Path, mon
     monkeypatch.chdir(clone / "renamed")
     if edited:
         edit(file, replay={"mode": "open_loop"})
-    data = claim_folder(file).data
+    data = claim_folder(file).run_folder
     assert (data / "trajectories" / finished.name).read_bytes() == b"hours of work"
 
 
@@ -158,7 +158,7 @@ def test_a_file_may_be_named_by_its_absolute_path_and_from_elsewhere(
     edit(file, folder=str(clone / "results"))
     claim_folder(file)
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
-    assert claim_folder(clone / file).data == open_run(clone / file).folder == clone / "results" / "tiny"
+    assert claim_folder(clone / file).run_folder == open_run(clone / file).folder == clone / "results" / "tiny"
     monkeypatch.chdir(clone)
     claim_folder(file)
 
@@ -203,7 +203,7 @@ def test_a_folder_that_was_moved_to_where_the_configuration_says_is_found(
     claim_folder(file)
     shutil.move("data/tiny", disk / "tiny")
     edit(file, folder=str(disk))
-    assert claim_folder(file).data == open_run(file).folder == disk / "tiny"
+    assert claim_folder(file).run_folder == open_run(file).folder == disk / "tiny"
     edit(file, plan={"seed": 6, "episodes": {"noise": 4}})
     claim_folder(file)
     shutil.move(disk / "tiny", "data/tiny")
@@ -356,7 +356,7 @@ def test_a_full_disk_leaves_no_half_of_the_mark(clone: Path) -> None:
 
 def test_a_link_in_place_of_a_runs_folder_is_rejected(clone: Path) -> None:
     """A stage deletes what it did not plan: what the link leads to may be somebody else's."""
-    data = claim_folder(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).run_folder
     (data / "frames").symlink_to(clone / "configs")
     with pytest.raises(PipelineError, match="data/tiny/frames: the entry of the run's folder is a symbolic link"):
         claim_folder(Path("configs/tiny.yaml"))
@@ -374,7 +374,7 @@ FOREIGN = (
 
 @pytest.mark.parametrize("place", FOREIGN)
 def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone: Path) -> None:
-    theirs = claim_folder(Path("configs/tiny.yaml")).data / place
+    theirs = claim_folder(Path("configs/tiny.yaml")).run_folder / place
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
     with pytest.raises(
@@ -385,7 +385,7 @@ def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone
 
 
 def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
-    data = claim_folder(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).run_folder
     link = data / "trajectories" / "0123456789abcdef.npz"
     link.parent.mkdir()
     link.symlink_to(clone / "configs" / "tiny.yaml")
@@ -397,7 +397,7 @@ def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
 def test_clean_names_a_file_that_no_stage_made(
     place: str, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    theirs = claim_folder(Path("configs/tiny.yaml")).data / place
+    theirs = claim_folder(Path("configs/tiny.yaml")).run_folder / place
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")
     monkeypatch.setattr(sys, "argv", ["pipeline", "clean", "--yes", "configs/tiny.yaml"])
@@ -417,7 +417,7 @@ def test_clean_names_an_edited_file(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    data = claim_folder(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).run_folder
     edited, folder = data / place, data / place.partition("/")[0]
     edited.parent.mkdir(parents=True)
     if state != "without a record":
@@ -443,7 +443,7 @@ def test_clean_names_an_edited_file(
 def test_clean_names_a_file_that_no_export_recorded(
     place: str, recorded: bool, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = claim_folder(Path("configs/tiny.yaml")).data
+    data = claim_folder(Path("configs/tiny.yaml")).run_folder
     theirs = data / place
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"mine")

@@ -180,7 +180,7 @@ def test_the_hours_are_those_of_the_frames_that_would_be_rendered_again(clone: P
     """All frames of the run under another JPEG quality, at the measured cost of a frame on the reference machine."""
     config = load(Path("configs/tiny.yaml"))
     machine.keep_speed(Run(config), REFERENCE)
-    stored = FrameStore(config.data / "frames", config.render).rows().values()
+    stored = FrameStore(config.run_folder / "frames", config.render).rows().values()
     frames = sum(len(row["streams"]) * row["steps"] for row in stored)
     assert frames > 100
     changed(clone, other_quality)

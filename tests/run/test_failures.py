@@ -104,12 +104,12 @@ def test_validate_checks_them_and_finds_a_success_among_them(asked: Path, tmp_pa
     shutil.copytree(asked.parents[1], tmp_path, dirs_exist_ok=True)
     with chdir(tmp_path):
         config = load(Path("configs/tiny.yaml"))
-        file = config.data / "failures" / "lerobot" / "tiny_failures" / "meta" / "provenance.parquet"
+        file = config.run_folder / "failures" / "lerobot" / "tiny_failures" / "meta" / "provenance.parquet"
         table = pq.read_table(file)
         succeeded = pa.array([True] * len(table))
         place = table.schema.get_field_index("success")
         pq.write_table(table.set_column(place, table.schema.field("success"), succeeded), file)
-        sets = config.export.failure_datasets(config.data, config.render.content)
+        sets = config.export.failure_datasets(config.run_folder, config.render.content)
         job = EpisodesJob(Run(config), sets, tmp_path / "cache", frozenset(), of_failures=True)
         found = job([missed[0] | places(sets)[missed[0]["episode_id"]]]).findings
     told = {check: {fault.dataset for fault in faults} for check, faults in found.items() if faults}
@@ -158,15 +158,17 @@ def test_a_damaged_set_of_failures_leaves_the_record_of_the_others(asked: Path, 
     with chdir(tmp_path):
         config = load(Path("configs/tiny.yaml"))
         (failed,) = (
-            one for one in config.export.failure_datasets(config.data, config.render.content) if one.name == "rlds"
+            one
+            for one in config.export.failure_datasets(config.run_folder, config.render.content)
+            if one.name == "rlds"
         )
         write_inputs(Run(config))
-        assert failed.record_file.relative_to(config.data).as_posix() in read_json(config.data / DATASETS)
+        assert failed.record_file.relative_to(config.run_folder).as_posix() in read_json(config.run_folder / DATASETS)
         next(failed.folder.rglob("*.tfrecord*")).write_bytes(b"damaged")
         write_inputs(Run(config))
         assert not failed.record_file.exists()
-        assert not (config.data / DATASETS).exists(), "so that DVC starts the exports"
-        assert {name for name in PARTS["rlds"].names if (config.data / name).exists()} == {
+        assert not (config.run_folder / DATASETS).exists(), "so that DVC starts the exports"
+        assert {name for name in PARTS["rlds"].names if (config.run_folder / name).exists()} == {
             "rlds",
             "rlds.json",
             "failures/rlds",

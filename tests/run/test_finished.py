@@ -74,7 +74,7 @@ def test_a_finished_run_is_remembered_until_something_changes(config: Config, mo
     ],
 )
 def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[bool]) -> None:
-    file = config.data / name
+    file = config.run_folder / name
     changed = largest(file) if file.is_dir() else file
     changed.write_bytes(changed.read_bytes() + b"\n")
     assert hold(config) == expected
@@ -102,25 +102,25 @@ def test_previews_are_rendered_again_for_other_views(tmp_path: Path) -> None:
     ],
 )
 def test_a_lost_file_is_named(config: Config, name: str, stage: str) -> None:
-    lost = config.data / name
+    lost = config.run_folder / name
     if lost.is_dir():
         lost = max(lost.rglob("*.*"), key=lambda file: (file.is_file() and file.name != TABLE, file.stat().st_size))
     assert stages.why_not(stage, Run(config)) is None
     lost.unlink()
-    reason = f"{lost.relative_to(config.data).as_posix()} is missing"
+    reason = f"{lost.relative_to(config.run_folder).as_posix()} is missing"
     assert stages.why_not(stage, Run(config)) == reason
     if name != "datasets.json":
         assert validate_memory(Run(config)).why_not() == reason
 
 
 def test_what_found_something_off_is_not_remembered(config: Config) -> None:
-    rot(largest(config.data / "rlds"))
-    (config.data / "validation.json").unlink()
+    rot(largest(config.run_folder / "rlds"))
+    (config.run_folder / "validation.json").unlink()
     assert not validate_memory(Run(config)).holds(), "so everything is read again, also what looks unchanged"
 
 
 def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Config) -> None:
-    for one in config.export.datasets(config.data, config.render.content):
+    for one in config.export.datasets(config.run_folder, config.render.content):
         content = {name: (one.folder / name).read_bytes() for name in one.record().files}
         name = max(content, key=lambda name: len(content[name]))
         # As in a copy that has the time of the copying.
@@ -147,8 +147,8 @@ def test_a_finished_dataset_is_generated_again_only_where_that_was_allowed(
 
 
 def test_a_lost_shard_is_made_again_and_a_damaged_trajectory_once_it_is_moved_away(clone: Path, config: Config) -> None:
-    shard = largest(config.data / "rlds")
-    trajectory = next((config.data / "trajectories").glob("*.npz"))
+    shard = largest(config.run_folder / "rlds")
+    trajectory = next((config.run_folder / "trajectories").glob("*.npz"))
     before = shard.read_bytes(), trajectory.read_bytes()
     shard.unlink()
     trajectory.write_bytes(before[1][: len(before[1]) // 2])

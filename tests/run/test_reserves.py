@@ -47,7 +47,7 @@ def reserved(demos: Path) -> dict[str, object]:
 def reject_frames_of_first_candidate(clone: Path, fields: dict[str, object]) -> None:
     """Store what a render stage stores where no worker survives the frames of the first candidate of ``layout``."""
     config = Config.model_validate(fields)
-    data = clone / config.data
+    data = clone / config.run_folder
     for row in plan.read(data / "plan.parquet"):
         if row.axis == "layout" and row.rank == 0:
             streams = tuple(streams_of(row.perturbations).values())

@@ -382,9 +382,9 @@ def test_every_format_gets_rewrites_and_subtasks(
 ) -> None:
     monkeypatch.chdir(finished.parents[1])
     config = load(Path("configs/tiny.yaml"))
-    plain = LeRobot(config.data, config.export.options_for(LeRobot) or LeRobotConfig())
+    plain = LeRobot(config.run_folder, config.export.options_for(LeRobot) or LeRobotConfig())
     # Where lerobot is older, reading a configuration rejects it.
-    told = LeRobot(config.data, plain.options.model_copy(update={"language": True}))
+    told = LeRobot(config.run_folder, plain.options.model_copy(update={"language": True}))
     episodes, given = (episodes_of(target, Run(config)) for target in (plain, told))
     assert {one.content for one in given.facts.values()} == {one.content for one in episodes.facts.values()}
     bank = yaml.safe_load(BANK_FILE.read_text())

@@ -321,7 +321,7 @@ def test_a_run_goes_on_where_steps_and_frames_are_the_same(
     link_testset(tmp_path)
     config = load(REPOSITORY / "configs" / "starter.yaml")
     run_stage(config)
-    stored(config.data, "trajectories", "frames")
+    stored(config.run_folder, "trajectories", "frames")
     assert run_doctor("starter", monkeypatch, free_gb=1) == []
     trial["one frame"] = "89ab"
     assert run_doctor("starter", monkeypatch, free_gb=1) == ["same machine"]

@@ -43,7 +43,7 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         config = with_v21(finished)
         options = config.export.options_for(LeRobotV21)
         assert options is not None
-        target = LeRobotV21(config.data, options)
+        target = LeRobotV21(config.run_folder, options)
         export(target, episodes_of(target, Run(config)), loop)
     return folder
 
@@ -180,7 +180,7 @@ def test_faults_of_either_version_are_found(
     shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     config = with_v21(finished)
-    plant(min(path for path in (config.data / version).iterdir() if path.is_dir()), version)
+    plant(min(path for path in (config.run_folder / version).iterdir() if path.is_dir()), version)
     found = checked(version, config)
     assert checks & found.keys()
     assert {fault.dataset for faults in found.values() for fault in faults} == {version}
@@ -197,10 +197,10 @@ def test_language_columns_are_held_against_what_was_to_be_written(
     told = options.model_copy(update={"language": True})
     config = config.model_copy(update={"export": config.export.model_copy(update={"lerobot": told})})
     monkeypatch.chdir(tmp_path)
-    target = LeRobot(config.data, told)
+    target = LeRobot(config.run_folder, told)
     export(target, episodes_of(target, Run(config)), loop)
-    job = EpisodesJob(Run(config), [target], config.data, frozenset())
-    rows = [row for row in manifest.read(config.data / "manifest.parquet") if row["kept"]]
+    job = EpisodesJob(Run(config), [target], config.run_folder, frozenset())
+    rows = [row for row in manifest.read(config.run_folder / "manifest.parquet") if row["kept"]]
     assert not any(job(rows).findings.values())
     file = min(target.root.glob("data/*/*"))
     table = pq.read_table(file)
