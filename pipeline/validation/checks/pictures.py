@@ -1,4 +1,4 @@
-"""Checks of frames: equality with the stored frames, and views that show what their camera saw."""
+"""Checks of frames: equality with the stored frames, and faulty views, such as blank or exchanged ones."""
 
 from collections.abc import Callable, Iterator
 
