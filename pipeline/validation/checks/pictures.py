@@ -1,4 +1,4 @@
-"""Checks of frames: equality with the stored frames, and views with the picture of their own camera."""
+"""Checks of frames: equality with the stored frames, and faulty views, such as blank or exchanged ones."""
 
 from collections.abc import Callable, Iterator
 
