@@ -22,7 +22,7 @@ from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation import held_out, results
 from pipeline.evaluation.checkpoint import Checkpoint
-from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings, Progress
+from pipeline.evaluation.environment import Episode, EpisodeEnvironment, EpisodeSettings, Progress
 from pipeline.evaluation.evaluate import EvaluationJob, _open_environment, evaluate
 from pipeline.evaluation.evaluation import Evaluation
 from pipeline.evaluation.policies import Wanted
@@ -53,8 +53,8 @@ def test_the_table_of_test_tasks_is_of_one_observation(tmp_path: Path) -> None:
 
     def save(axis: str, wanted: Wanted) -> None:
         for task in select(Selection(source="libero_plus", suites=(STOVE.suite,), axes=(axis,), subset=2)):
-            ended = {"task": task, "progress": Progress(9, "success"), "perturbations": (), "instruction": "x"}
-            environment: Any = SimpleNamespace(**ended, step_limit=STEPS, looks=5)
+            ended = Episode(task, STOVE, STEPS, Progress(9, "success"), looks=5)
+            environment: Any = SimpleNamespace(episode=ended, instruction="x")
             done.save(environment, wanted)
 
     save("camera", Wanted(state=True))
