@@ -31,6 +31,7 @@ from pipeline.types import Extra
 from pipeline.validation import doctor
 from pipeline.validation.needs import needed_mb
 
+ID = "0123456789abcdef"
 REAL_TRIAL = machine.trial
 
 
@@ -175,7 +176,7 @@ def test_demonstrations_count_by_their_files_and_before_by_what_is_published(sho
 def test_what_a_run_has_made_already_needs_no_more_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     link_testset(tmp_path)
-    frames = tmp_path / "data" / "starter" / "frames" / "0123" / "4567.h5"
+    frames = tmp_path / "data" / "starter" / "frames" / ID / f"{ID}.h5"
     frames.parent.mkdir(parents=True)
     with frames.open("wb") as file:
         file.truncate(500_000_000)
@@ -285,8 +286,8 @@ def test_a_missing_asset_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 def stored(folder: Path, *names: str) -> Path:
     """A run's folder with a file in each of these folders, as if made there."""
     for name in names:
-        (folder / name / "0123").mkdir(parents=True)
-        seal(folder / name / "0123" / "4567.npz", {}, {"made_by": "another version"})
+        (folder / name / ID).mkdir(parents=True)
+        seal(folder / name / ID / f"{ID}.npz", {}, {"made_by": "another version"})
     return folder
 
 
@@ -387,6 +388,6 @@ def test_a_damaged_file_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.chdir(tmp_path)
     link_testset(tmp_path)
     folder = stored(tmp_path / "data" / "starter", "frames")
-    file = folder / "frames" / "0123" / "4567.npz"
+    file = folder / "frames" / ID / f"{ID}.npz"
     file.write_bytes(file.read_bytes()[:-100])
     assert run_doctor("starter", monkeypatch, free_gb=1) == ["finished work"]
