@@ -94,7 +94,7 @@ def _move_aside(target: AnyFormat, files: Collection[Path]) -> None:
         place = aside / file.relative_to(target.folder)
         place.parent.mkdir(parents=True, exist_ok=True)
         os.replace(file, place)
-    print(f"{len(files)} files of {target.folder} that no export wrote are now in {aside}")
+    print(f"{len(files)} edited or foreign files of {target.folder} are now in {aside}")
 
 
 def remove_unneeded_files(target: AnyFormat) -> None:
