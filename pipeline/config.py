@@ -25,7 +25,7 @@ from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish_config import PublishConfig
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
-from pipeline.types import LONGEST_NAME, Count, Frozen, Place, RenderedExtra, find_home
+from pipeline.types import LONGEST_NAME, NO_TRUTH, Count, Frozen, Place, RenderedExtra, find_home
 
 CHECKOUT = (
     *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),
@@ -109,7 +109,7 @@ class PlanConfig(Frozen):
         task_weights: Weight of ``<suite>/<task>`` in the distribution of episodes over the tasks; 1 by default.
     """
 
-    seed: int = Field(default=0, strict=True, ge=-(2**63), lt=2**63)
+    seed: Annotated[int, Field(ge=-(2**63), lt=2**63), NO_TRUTH] = 0
     axes: Axes = Axes()
     episodes: dict[str, Count]
     reserve: float = Field(default=0.5, ge=0.0, le=10.0)

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NewType
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -48,7 +57,21 @@ class Frozen(BaseModel):
         return schema
 
 
-Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000)]
+def _reject_truth(value: Any) -> Any:
+    """Reject ``true`` and ``false``, which pydantic reads as 1 and 0.
+
+    Raises:
+        ValueError: if the value is one of them.
+    """
+    if isinstance(value, bool):
+        raise ValueError("expected a whole number")
+    return value
+
+
+NO_TRUTH = BeforeValidator(_reject_truth)
+"""Annotation of a number that rejects ``true`` and ``false``."""
+
+Count = Annotated[int, Field(ge=1, le=1_000_000), NO_TRUTH]
 """A number of files or episodes. Numbers above the limit would fill the memory before any message appears."""
 
 LONGEST_NAME = 60

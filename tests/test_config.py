@@ -411,7 +411,7 @@ def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest
 def test_true_is_no_number(fields: str, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text(f"name: mine\n{fields}")
-    with pytest.raises(PipelineError, match=r"plan\.(episodes\.camera|seed): expected a whole number, got True"):
+    with pytest.raises(PipelineError, match=r"plan\.(episodes\.camera|seed): expected a whole number \(got True\)"):
         load(file)
 
 
