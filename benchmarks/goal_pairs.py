@@ -12,7 +12,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from pipeline.axes.goal import GoalPerturbation, held_out, level, usable
+from pipeline.axes.goal import GoalPerturbation, held_out_pairs, level_of_pair, usable
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.libero.tasks import SUITES
 from pipeline.machine_code import ensure_fixed_machine_code
@@ -44,11 +44,11 @@ def yields(suite: str, start: int, folder: Path) -> dict[str, object]:
         (entry,) = demos.index().entries
         (twin,) = plan.twins([entry], 0, settings)
         ReplayJob(twin, twin.trajectory_id, demos, settings, folder)()
-        change = GoalPerturbation(scene=pair.scene.name, start=start, level=level(pair.task, pair.scene))
+        change = GoalPerturbation(scene=pair.scene.name, start=start, level=level_of_pair(pair.task, pair.scene))
         row = plan.build_row(entry, [change], 0, settings)
         verdict = ReplayJob(row, twin.trajectory_id, demos, settings, folder)()
         reasons[verdict.reason] += 1
-        held = " (held out)" if (pair.task, pair.scene) in held_out(suite) else ""
+        held = " (held out)" if (pair.task, pair.scene) in held_out_pairs(suite) else ""
         print(f"{verdict.reason}: {pair.task} in {pair.scene.name}{held}", flush=True)
     return {"pairs": len(tried), "kept": reasons["kept"], "reasons": dict(reasons)}
 

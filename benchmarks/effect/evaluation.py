@@ -26,7 +26,7 @@ from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task
 from pipeline.files import read_json, write_json
-from pipeline.libero.carried import carried, definition_of
+from pipeline.libero.carried import carry, definition_of
 from pipeline.testset import benchmark
 from pipeline.types import Task
 
@@ -87,7 +87,7 @@ def _held_out_goals(tasks: Sequence[Task], states: int) -> list[EvaluationTask]:
     asked: set[Hashable] = set()
     for instruction in every_instruction(tasks):
         if instruction.asked and instruction.kind == "held out":
-            asked.add(definition_of(carried(instruction.asked, instruction.scene)).asked)
+            asked.add(definition_of(carry(instruction.asked, instruction.scene)).asked)
     suites = tuple(dict.fromkeys(task.suite for task in tasks))
     goals = select(Selection(source="goals", suites=suites, episodes=states))
     return [goal for goal in goals if resolve_goal(goal)[1] in asked]

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.axes.goal import held_out, usable
+from pipeline.axes.goal import held_out_pairs, usable
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Fact
-from pipeline.libero.carried import carried, definition_of
+from pipeline.libero.carried import carry, definition_of
 from pipeline.libero.tasks import find_task
 from pipeline.types import Task
 
@@ -62,7 +62,7 @@ def instructions_in(scene: Task, tasks: Sequence[Task]) -> list[Instruction]:
     listed = [Instruction(scene, task, "own") for task in tasks if bddl.read(task.bddl_file).scene == place]
     for pair in usable(scene.suite):
         if pair.task in tasks and bddl.read(pair.scene.bddl_file).scene == place:
-            held = (pair.task, pair.scene) in held_out(scene.suite)
+            held = (pair.task, pair.scene) in held_out_pairs(scene.suite)
             listed.append(Instruction(scene, pair.task, "held out" if held else "carried"))
     return [*listed, Instruction(scene, None, "nothing")]
 
@@ -87,7 +87,7 @@ def at_own_place(suite: str, scene: str, asked: str) -> bool:
         asked: name of the task that is carried to the scene.
     """
     task = find_task(suite, asked)
-    own, played = definition_of(task), definition_of(carried(task, find_task(suite, scene)))
+    own, played = definition_of(task), definition_of(carry(task, find_task(suite, scene)))
     apart_m = np.subtract(own.centres_m[own.targets[0]], played.centres_m[played.targets[0]])
     return bool(np.linalg.norm(apart_m) < SAME_PLACE_M)
 
@@ -97,6 +97,6 @@ def goals_in(scene: Task, tasks: Sequence[Task]) -> dict[str, tuple[Fact, ...]]:
     goals: dict[str, tuple[Fact, ...]] = {}
     for instruction in instructions_in(scene, tasks):
         if instruction.asked:
-            played = instruction.asked if instruction.kind == "own" else carried(instruction.asked, scene)
+            played = instruction.asked if instruction.kind == "own" else carry(instruction.asked, scene)
             goals[instruction.asked.name] = definition_of(played).goal
     return goals

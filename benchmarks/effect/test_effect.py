@@ -29,7 +29,7 @@ from states import relative_by_episode
 
 from pipeline.__main__ import main
 from pipeline.axes import to_json
-from pipeline.axes.goal import held_out
+from pipeline.axes.goal import held_out_pairs
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
@@ -164,7 +164,7 @@ def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> N
     assert counts == {("libero", "clean"): 30, ("libero_plus", "language"): 40, ("goals", "goal"): 50}
     goals = [task for task in tested if task.source == "goals"]
     assert {task.number for task in goals} == set(range(5))
-    held = {(scene.name, task.instruction) for task, scene in held_out("libero_object")}
+    held = {(scene.name, task.instruction) for task, scene in held_out_pairs("libero_object")}
     assert {(task.base, resolve_goal(task)[0].instruction) for task in goals} == held
     instructed = evaluation.instructed_episodes(experiment)
     assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(instructed)

@@ -21,7 +21,7 @@ from pipeline.axes.report_data import CoveragePlots, KeptPerturbation, Strips
 from pipeline.files import checksum
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
-from pipeline.libero.carried import CannotCarryError, carried, definition_of
+from pipeline.libero.carried import CannotCarryError, carry, definition_of
 from pipeline.libero.task_goal import has_lookalike_in_place
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.testset.benchmark import TestSet
@@ -50,7 +50,7 @@ class Pair(NamedTuple):
     @property
     def played(self) -> Task:
         """The task in the other scene."""
-        return carried(self.task, self.scene)
+        return carry(self.task, self.scene)
 
 
 @cache
@@ -79,7 +79,7 @@ def _fault(task: Task, scene: Task) -> str:
     for other in tasks(task.suite):
         if other.instruction == task.instruction and bddl.read(other.bddl_file).scene == place:
             return "LIBERO has this instruction in the scene"
-    played = carried(task, scene)
+    played = carry(task, scene)
     try:
         definition_of(played)
     except CannotCarryError as error:
@@ -89,7 +89,7 @@ def _fault(task: Task, scene: Task) -> str:
 
 
 @cache
-def held_out(suite: str) -> frozenset[tuple[Task, Task]]:
+def held_out_pairs(suite: str) -> frozenset[tuple[Task, Task]]:
     """Return the pairs (task, scene) that no plan uses: a fixed fifth of the suite's pairs, chosen by a hash."""
     shuffled = sorted(usable(suite), key=lambda pair: seeding.digest("held-out goal", str(pair.task), str(pair.scene)))
     return frozenset((pair.task, pair.scene) for pair in shuffled[: round(len(shuffled) / HELD_OUT)])
@@ -102,14 +102,14 @@ def _trained(task: Task) -> tuple[Task, ...]:
     Pairs are left out that are held out, or whose scene has another object in the place that the instruction names.
     """
     pairs_of_task = [pair for pair in usable(task.suite) if pair.task == task]
-    not_held_out = [pair for pair in pairs_of_task if (task, pair.scene) not in held_out(task.suite)]
+    not_held_out = [pair for pair in pairs_of_task if (task, pair.scene) not in held_out_pairs(task.suite)]
     return tuple(pair.scene for pair in not_held_out if not has_lookalike_in_place(pair.played))
 
 
 @cache
-def level(task: Task, scene: Task) -> Level:
+def level_of_pair(task: Task, scene: Task) -> Level:
     """Return the strength of a pair: the distance in the scene between the first things that both tasks take."""
-    played = definition_of(carried(task, scene))
+    played = definition_of(carry(task, scene))
     centres_m = played.centres_m
     usual_m, carried_m = (centres_m.get(_first_thing(each), (0.0, 0.0)) for each in (definition_of(scene), played))
     apart_m = float(np.linalg.norm(np.subtract(usual_m, carried_m)))
@@ -141,7 +141,7 @@ class GoalPerturbation(PhysicsPerturbation):
 
     def played(self, task: Task) -> Task:
         """Return ``task`` in the other scene."""
-        return carried(task, find_task(task.suite, self.scene))
+        return carry(task, find_task(task.suite, self.scene))
 
     @property
     def reset_seed(self) -> int:
@@ -179,7 +179,7 @@ class GoalAxis(Axis):
 
     def entries(self, task: Task) -> Sequence[str]:
         """List the names of the scenes to which the task is carried, of the configured levels."""
-        return [scene.name for scene in _trained(task) if level(task, scene) in self.levels]
+        return [scene.name for scene in _trained(task) if level_of_pair(task, scene) in self.levels]
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> GoalPerturbation:
         """Return the scene at ``place`` of ``entries``, which start again at their end, with one of its starts."""
@@ -187,7 +187,7 @@ class GoalAxis(Axis):
         scene = find_task(task.suite, scenes[place % len(scenes)])
         start = int(rng.integers(self.starts))
         sha256 = "" if scene.suite in SUITES else checksum(scene.bddl_file)
-        return GoalPerturbation(scene=scene.name, start=start, level=level(task, scene), scene_sha256=sha256)
+        return GoalPerturbation(scene=scene.name, start=start, level=level_of_pair(task, scene), scene_sha256=sha256)
 
     @classmethod
     def describe_coverage(cls, kept: Sequence[KeptPerturbation[GoalPerturbation]], test: TestSet) -> CoveragePlots:

@@ -6,7 +6,7 @@ other function words or another order change many characters.
 
 from functools import cache
 
-from pipeline.axes.language_goal import words
+from pipeline.axes.language_goal import read_words
 from pipeline.axes.language_lint import normalise
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Task
@@ -29,7 +29,7 @@ def copies_test(text: str, test: TestSet, task: Task) -> bool:
     """
     if content_words(text) in _tested_contents(test, task):
         return True
-    known = {*words().common, *normalise(task.instruction).split()}
+    known = {*read_words().common, *normalise(task.instruction).split()}
     shared_phrases = phrases(text) & _tested_phrases(test, task)
     return any(len(set(phrase) - known) >= MIN_NEW_WORDS for phrase in shared_phrases)
 
@@ -43,7 +43,7 @@ def phrases(text: str) -> frozenset[tuple[str, ...]]:
 
 def content_words(text: str) -> frozenset[str]:
     """Return the words of a text without the words ``function`` of ``language_words.yaml``."""
-    return frozenset(normalise(text).split()) - {*words().function}
+    return frozenset(normalise(text).split()) - {*read_words().function}
 
 
 def _tested_texts(test: TestSet, task: Task) -> list[str]:

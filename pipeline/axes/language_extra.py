@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
-from pipeline.axes.language_goal import Mention, Reading, thing_words, words
+from pipeline.axes.language_goal import Mention, Reading, read_words, thing_words
 from pipeline.libero.carried import definition_of
 from pipeline.libero.task_goal import read_goal
 from pipeline.types import Task
@@ -71,7 +71,7 @@ def surroundings(task: Task) -> Surroundings:
     objects = list(bddl.objects.values())
     asked = {change.state for change in goal.changes} | {*task.instruction.lower().split()}
     states = {}
-    for state, wording in words().states.items():
+    for state, wording in read_words().states.items():
         kinds = tuple(kind for kind in wording.of if kind in goal.scene)
         if kinds and state not in asked:
             states[state] = kinds
@@ -123,7 +123,7 @@ def _is_asked_for(mention: Mention, reading: Reading, of_goal: frozenset[str]) -
     """Return whether the words around a thing move it, join it to a thing of the goal, or send it to a place."""
     before, after = reading.plain[: mention.at], reading.plain[mention.end :]
     moved = re.search(
-        rf"\b(?:{'|'.join(words().moves)})(?: up| out)?(?: (?:the|a|an|its|that|both))?(?: \w+)? $", before
+        rf"\b(?:{'|'.join(read_words().moves)})(?: up| out)?(?: (?:the|a|an|its|that|both))?(?: \w+)? $", before
     )
     if moved and not _NOT.search(before[: moved.start()].rstrip()):
         return True
@@ -139,7 +139,7 @@ def _asks_for_state(plain: str, state: str, kinds: tuple[str, ...], hints: bool)
     """Return whether a text asks for a state of one of ``kinds``."""
     thing = rf"(?:door|{'|'.join(thing_words(kinds, hints))})s?"
     it = rf"(?:it|(?:the|its|that|this)(?: \w+){{0,2}} {thing}|that|which)"
-    wording = words().states[state]
+    wording = read_words().states[state]
     entries = wording.asked if hints else wording.asked + wording.wished
     for entry in entries:
         request = entry.replace("IT", it).replace("THING", thing)

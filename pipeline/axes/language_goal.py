@@ -91,7 +91,7 @@ class Words(Frozen):
 
 
 @cache
-def words() -> Words:
+def read_words() -> Words:
     """Read the shipped words."""
     text = Path(__file__).with_name("language_words.yaml").read_text("ascii")
     return Words.model_validate(yaml.safe_load(text))
@@ -106,7 +106,7 @@ def thing_words(scene: tuple[str, ...], hints: bool) -> Mapping[str, tuple[str, 
     """
     meant: dict[str, tuple[str, ...]] = {}
     for kind in scene:
-        thing = words().things.get(kind)
+        thing = read_words().things.get(kind)
         if thing is None:
             entries: tuple[str, ...] = (kind.replace("_", " "), kind.rpartition("_")[2])
         elif hints:
@@ -122,19 +122,19 @@ def thing_words(scene: tuple[str, ...], hints: bool) -> Mapping[str, tuple[str, 
 def relation_words() -> Mapping[str, tuple[str, ...]]:
     """Map each word to the relation that it means, as a tuple with one entry."""
     meant: dict[str, tuple[str, ...]] = {}
-    for relation, entries in words().relations.items():
+    for relation, entries in read_words().relations.items():
         for word in entries:
             meant[word] = (relation,)
     return meant
 
 
-def found(plain: str, meant: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[re.Match[str], tuple[str, ...]]]:
+def find_words(plain: str, meant: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[re.Match[str], tuple[str, ...]]]:
     """Find the words of ``meant`` in a text.
 
     Yields:
         The match of a word, and the meanings of the word.
     """
-    for match in pattern(tuple(meant)).finditer(plain):
+    for match in compile_pattern(tuple(meant)).finditer(plain):
         word = _longest_first(meant)[(match.lastindex or 0) - 1]
         yield match, meant[word]
 
@@ -145,7 +145,7 @@ def _longest_first(entries: Iterable[str]) -> list[str]:
 
 
 @cache
-def pattern(entries: tuple[str, ...]) -> re.Pattern[str]:
+def compile_pattern(entries: tuple[str, ...]) -> re.Pattern[str]:
     """Compile a pattern of any of the entries as whole words, the longest first.
 
     The number of the matched group, counted from 1, is the entry's place in this order.
@@ -186,7 +186,7 @@ class Reading:
         """Read ``text`` in a ``scene`` that consists of these kinds of things."""
         self.plain, self.hints = _plain(text), hints
         relations: list[tuple[int, int, str]] = []
-        for match, (meaning,) in found(self.plain, relation_words()):
+        for match, (meaning,) in find_words(self.plain, relation_words()):
             relations.append((match.start(), match.end(), meaning))
         self.back: list[tuple[int, str]] = []
         for start, end, meaning in relations:
@@ -194,7 +194,7 @@ class Reading:
                 self.back.append((start, meaning))
         self.mentions: list[Mention] = []
         before = 0
-        for match, kinds in found(self.plain, thing_words(tuple(scene), hints)):
+        for match, kinds in find_words(self.plain, thing_words(tuple(scene), hints)):
             relation: str | None = None
             for start, end, meaning in relations:
                 if start >= before and self._leads(end, match.start()):
@@ -215,35 +215,35 @@ class Reading:
 
     def has(self, patterns: Sequence[str]) -> bool:
         """Return whether the text has one of the ``patterns`` as whole words."""
-        return pattern(tuple(patterns)).search(self.plain) is not None
+        return compile_pattern(tuple(patterns)).search(self.plain) is not None
 
     def tells(self, kind: str, moved: frozenset[str]) -> bool:
         """Return whether a word means this kind alone in the scene, or exactly the two moved kinds together."""
-        together = moved if kind in moved and self.has(words().both) else frozenset()
+        together = moved if kind in moved and self.has(read_words().both) else frozenset()
         return any(kind in mention.kinds and {*mention.kinds} <= together | {kind} for mention in self.mentions)
 
     def tells_part(self, part: str) -> bool:
         """Return whether the text names this drawer or side, or excludes both other drawers by naming them."""
-        if self.has(words().parts[part]):
+        if self.has(read_words().parts[part]):
             return True
         if part not in DRAWERS or not self.hints:
             return False
-        return all(self.has(words().parts[drawer]) for drawer in DRAWERS - {part})
+        return all(self.has(read_words().parts[drawer]) for drawer in DRAWERS - {part})
 
     def tells_top(self, top: bool) -> bool:
         """Return whether the text has words for the top of a shelf exactly if ``top`` is true.
 
         LIBERO uses ``on`` for the boards of a shelf too.
         """
-        return self.has(words().top) == top
+        return self.has(read_words().top) == top
 
     def keeps_outside(self) -> bool:
         """Return whether the text names no drawer, as a place on top demands; texts with ``hints`` always pass."""
-        return self.hints or not self.has(words().drawer)
+        return self.hints or not self.has(read_words().drawer)
 
     def tells_state(self, state: str) -> bool:
         """Return whether the text has words for a state and none for its opposite."""
-        return self.has(words().states[state].said) and not self.has(words().states[state].opposite)
+        return self.has(read_words().states[state].said) and not self.has(read_words().states[state].opposite)
 
     def relates(self, aim: Aim, accepted: frozenset[str], others: frozenset[str]) -> bool:
         """Return whether the aim's place has an accepted relation, or no relation that contradicts it.
@@ -286,7 +286,7 @@ class Reading:
     def _places(self, aim: Aim) -> Iterator[int]:
         """List the positions in the text of the aim's place."""
         if aim.part:
-            for match in pattern(words().parts[aim.part]).finditer(self.plain):
+            for match in compile_pattern(read_words().parts[aim.part]).finditer(self.plain):
                 yield match.start()
             return
         for start, relation in self.back:
@@ -358,18 +358,18 @@ def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
     for part in dict.fromkeys(part for part in parts if part):
         yield Demand(f"does not identify the part {part!r}", partial(Reading.tells_part, part=part))
     for kind in goal.pairs:
-        yield Demand(f"does not name both {_name(kind)}s", partial(Reading.has, patterns=words().both))
+        yield Demand(f"does not name both {_name(kind)}s", partial(Reading.has, patterns=read_words().both))
     for aim in located:
         if aim.relation and aim.place:
             yield Demand(
                 f"does not keep the relation {aim.relation!r} to the {_name(aim.place)}", _relation(aim, goal, original)
             )
-            if aim.relation == "on" and not aim.part and aim.place in words().states["open"].of:
+            if aim.relation == "on" and not aim.part and aim.place in read_words().states["open"].of:
                 yield Demand(f"names the inside of the {_name(aim.place)}", Reading.keeps_outside)
-            if aim.place in words().shelves:
-                top = original.has(words().top)
+            if aim.place in read_words().shelves:
+                top = original.has(read_words().top)
                 yield Demand(_on_shelf(top), partial(Reading.tells_top, top=top))
-    states = {change.state for change in goal.changes} | {*words().states} & {*original.plain.split()}
+    states = {change.state for change in goal.changes} | {*read_words().states} & {*original.plain.split()}
     for state in sorted(states):
         yield Demand(f"does not ask to {state}", partial(Reading.tells_state, state=state))
     destinations = {aim._replace(thing="") for aim in goal.aims}
@@ -381,7 +381,7 @@ def _sides(goal: TaskGoal, original: Reading) -> list[str]:
     """List the sides in LIBERO's wording if a moved thing shares its kind or name with another thing."""
     moved = frozenset(aim.thing for aim in goal.aims)
     named = all(original.tells(kind, moved) for kind in moved) and not goal.pairs
-    return [] if named else [side for side in words().sides if side in original.plain.split()]
+    return [] if named else [side for side in read_words().sides if side in original.plain.split()]
 
 
 def _on_shelf(top: bool) -> str:

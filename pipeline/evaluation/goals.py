@@ -16,15 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.axes.goal import held_out, level
-from pipeline.axes.language_goal import found, pattern, thing_words, words
+from pipeline.axes.goal import held_out_pairs, level_of_pair
+from pipeline.axes.language_goal import compile_pattern, find_words, read_words, thing_words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
 from pipeline.evaluation.held_out import planned
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
-from pipeline.libero.carried import carried, definition_of
+from pipeline.libero.carried import carry, definition_of
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Floats, Task
 
@@ -189,7 +189,7 @@ def _reword(task: Task, old: str, category: str) -> str | None:
     scene = bddl.read(task.bddl_file)
     old_category, new_words = scene.objects[old], _find_words(task.suite, category)
     scene_words = thing_words(tuple(dict.fromkeys(map(scene.category, scene.things))), hints=False)
-    mentions = [match for match, kinds in found(task.instruction, scene_words) if old_category in kinds]
+    mentions = [match for match, kinds in find_words(task.instruction, scene_words) if old_category in kinds]
     if len(mentions) != 1 or _means_another(new_words, category, scene):
         return None
     before, after = task.instruction[: mentions[0].start()], task.instruction[mentions[0].end() :]
@@ -202,7 +202,7 @@ def _means_another(text: str, category: str, scene: Bddl) -> bool:
     """Return whether a text also means a thing of another category in the scene."""
     other_categories = {scene.category(thing) for thing in scene.things} - {category}
     other_words = thing_words(tuple(other_categories), hints=False)
-    return pattern(tuple(other_words)).fullmatch(text) is not None
+    return compile_pattern(tuple(other_words)).fullmatch(text) is not None
 
 
 @cache
@@ -219,9 +219,9 @@ def _find_words(suite: str, category: str) -> str:
                 categories = list(bddl.read(task.bddl_file).objects.values())
                 if categories.count(category) == 1:
                     instructions.append(task.instruction)
-        for thing_name in words().things[category].names:
+        for thing_name in read_words().things[category].names:
             for instruction in instructions:
-                match = pattern((thing_name,)).search(instruction)
+                match = compile_pattern((thing_name,)).search(instruction)
                 if match:
                     return match[0]
     raise PipelineError(
@@ -244,10 +244,10 @@ def list_carried_tasks(scene: Task, number: int) -> list[EvaluationTask]:
     """
     replaced = {_read_asked(scene, replacement) for replacement in list_replacements(scene)}
     listed = []
-    for task, place in sorted(held_out(scene.suite), key=str):
-        if place == scene and definition_of(carried(task, scene)).asked not in replaced:
+    for task, place in sorted(held_out_pairs(scene.suite), key=str):
+        if place == scene and definition_of(carry(task, scene)).asked not in replaced:
             name = f"{scene.name}{CARRIED}{task.name}_state{number}"
-            strength = level(task, scene)
+            strength = level_of_pair(task, scene)
             listed.append(
                 EvaluationTask("goals", task.suite, scene.name, name, "goal", "other_scene", strength, number)
             )
@@ -273,7 +273,7 @@ def resolve_goal(task: EvaluationTask) -> tuple[Task, Hashable]:
     base = find_task(task.suite, task.base)
     asked = find_carried_task(task)
     if asked is not None:
-        played = carried(asked, base)
+        played = carry(asked, base)
         return played, definition_of(played).asked
     replacement = find_replacement(base, task.name)
     return replace(base, instruction=replacement.instruction), _read_asked(base, replacement)

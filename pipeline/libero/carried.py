@@ -20,7 +20,7 @@ class CannotCarryError(ValueError):
     """The goal of a task has no meaning in a scene; the message states why in plain words."""
 
 
-def carried(task: Task, scene: Task) -> Task:
+def carry(task: Task, scene: Task) -> Task:
     """Return ``task`` in the scene of the task ``scene``: instruction and goal of the first, start of the second."""
     return replace(task, bddl_file=scene.bddl_file, goal_file=task.bddl_file)
 
@@ -37,7 +37,7 @@ def task_named(suite: str, name: str) -> Task:
         PipelineError: when the suite has no such task, or no task of this scene.
     """
     own, _, scene = name.partition(IN_SCENE)
-    return carried(find_task(suite, own), find_task(suite, scene)) if scene else find_task(suite, own)
+    return carry(find_task(suite, own), find_task(suite, scene)) if scene else find_task(suite, own)
 
 
 def definition_of(task: Task) -> Bddl:

@@ -134,7 +134,7 @@ def read_goal(task: Task) -> TaskGoal:
     )
 
 
-def called(bddl: Bddl, name: str) -> str:
+def describe_thing(bddl: Bddl, name: str) -> str:
     """Describe a thing or a part of it in plain words.
 
     For example, wooden_cabinet_1_middle_region is the middle drawer of the cabinet. If several things have one noun, an
@@ -159,12 +159,12 @@ def _find_side(instruction: str, noun: str) -> str | None:
     return match and match[1]
 
 
-def called_at_start(bddl: Bddl, name: str) -> str:
-    """Describe an object as ``called`` does, with its place at the start if it shares its noun and has no side.
+def describe_thing_at_start(bddl: Bddl, name: str) -> str:
+    """Describe an object as ``describe_thing`` does, with its place at the start if it shares its noun and has no side.
 
     For example, akita_black_bowl_1 is the black bowl next to the ramekin.
     """
-    scene, words = _Scene(bddl), called(bddl, name)
+    scene, words = _Scene(bddl), describe_thing(bddl, name)
     if not scene.has_namesakes(name) or {*words.split()} & {*SIDES}:
         return words
     aims = scene.unique_aims(fact for fact in bddl.start if len(fact) == 3 and fact[1] == name)
@@ -175,7 +175,7 @@ def called_at_start(bddl: Bddl, name: str) -> str:
     return f"{words} at the table center" if any(aim.part == "center" for aim in aims) else words
 
 
-def where(bddl: Bddl, fact: Fact) -> tuple[str, str]:
+def describe_place(bddl: Bddl, fact: Fact) -> tuple[str, str]:
     """Describe the place of a fact of the goal, as a direction and as a location: to the plate, on the plate.
 
     On the levels of a shelf, both say which: under the cabinet shelf.

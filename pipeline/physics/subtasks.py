@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.libero.bddl import Bddl, Fact
 from pipeline.libero.carried import definition_of
-from pipeline.libero.task_goal import called, called_at_start, where
+from pipeline.libero.task_goal import describe_place, describe_thing, describe_thing_at_start
 from pipeline.physics.reference import Mask, runs
 from pipeline.scenes.compiled import CompiledScene, contacts
 from pipeline.types import Floats, State, Subtask, Task, Trajectory
@@ -152,7 +152,9 @@ class _Seen:
         gripped, resting = self._gripped(body), self._touch(body, ~body & ~self.robot)
         first = int(self.model.joint(f"{fact[1]}_joint0").qposadr[0])
         positions_m = self.qpos[:, first : first + 3]
-        words = _Words(called(problem, fact[1]), called_at_start(problem, fact[1]), *where(problem, fact))
+        words = _Words(
+            describe_thing(problem, fact[1]), describe_thing_at_start(problem, fact[1]), *describe_place(problem, fact)
+        )
         for reached, left in _runs(self._touch(body, self.robot)):
             moved_m = _distances(positions_m[reached : left + 1], positions_m[reached])
             if moved_m.max() < MOVED_M:
@@ -200,7 +202,7 @@ class _Seen:
             bodies = [self.model.site_bodyid[site]]
         else:
             bodies = np.flatnonzero(self._below(self.model.body(f"{name}_main").id)).tolist()
-        thing = called(problem, name)
+        thing = describe_thing(problem, name)
         away, back = VERBS[state]
         for joint in np.flatnonzero(np.isin(self.model.jnt_bodyid, bodies)):
             turned = np.abs(self.qpos[:, self.model.jnt_qposadr[joint]]) / np.ptp(self.model.jnt_range[joint])

@@ -10,13 +10,13 @@ from conftest import starter_demo
 from libero.libero.envs.bddl_utils import robosuite_parse_problem
 
 from pipeline.axes import Axes, from_json, task_of, to_json
-from pipeline.axes.goal import GoalAxis, GoalPerturbation, held_out, level, pairs, usable
+from pipeline.axes.goal import GoalAxis, GoalPerturbation, held_out_pairs, level_of_pair, pairs, usable
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation, load_bank
 from pipeline.axes.language_goal import changed_goal
 from pipeline.axes.pose import PoseAxis, ScenePerturbation
 from pipeline.config import Config, DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import bddl
-from pipeline.libero.carried import CannotCarryError, bddl_text, carried, definition_of
+from pipeline.libero.carried import CannotCarryError, bddl_text, carry, definition_of
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.physics.environment import Environment
@@ -93,7 +93,7 @@ def test_scenes_of_the_other_suites(scene: tuple[str, str]) -> None:
 
 
 def test_every_pair_of_the_130_tasks_is_used_or_left_out_with_a_reason() -> None:
-    counts = {suite: (len(pairs(suite)), len(usable(suite)), len(held_out(suite))) for suite in SUITES}
+    counts = {suite: (len(pairs(suite)), len(usable(suite)), len(held_out_pairs(suite))) for suite in SUITES}
     assert counts == {
         "libero_spatial": (80, 8, 2),
         "libero_object": (90, 50, 10),
@@ -146,10 +146,10 @@ def test_the_bowl_is_the_one_that_the_instruction_means() -> None:
     scene = find_task("libero_spatial", f"{PICK}black_bowl_on_the_ramekin{PLATE}")
     task = find_task("libero_spatial", f"{PICK}black_bowl_on_the_cookie_box{PLATE}")
     assert definition_of(task).goal == (("on", "akita_black_bowl_1", "plate_1"),)
-    assert definition_of(carried(task, scene)).goal == (("on", "akita_black_bowl_2", "plate_1"),)
+    assert definition_of(carry(task, scene)).goal == (("on", "akita_black_bowl_2", "plate_1"),)
     assert ("on", "akita_black_bowl_2", "cookies_1") in definition_of(scene).start
     with pytest.raises(CannotCarryError, match="no akita black bowl stands at its place"):
-        definition_of(carried(scene, task))
+        definition_of(carry(scene, task))
 
 
 def test_levels_are_distances_between_what_both_tasks_take() -> None:
@@ -159,9 +159,9 @@ def test_levels_are_distances_between_what_both_tasks_take() -> None:
     )
     # Soup at (-0.12, -0.24), milk at (0.10, -0.20), butter at (-0.20, -0.08).
     assert np.hypot(0.22, 0.04) == pytest.approx(0.224, abs=1e-3)
-    assert level(milk, soup) == 3
+    assert level_of_pair(milk, soup) == 3
     assert np.hypot(0.08, 0.16) == pytest.approx(0.179, abs=1e-3)
-    assert level(butter, soup) == 2
+    assert level_of_pair(butter, soup) == 2
 
 
 UNCLEAR = (
@@ -188,7 +188,7 @@ def test_held_out_pairs_are_never_planned() -> None:
         planned = set()
         for task in tasks(suite):
             planned |= {(task.name, scene) for scene in axis.entries(task)}
-        held = {(task.name, scene.name) for task, scene in held_out(suite)}
+        held = {(task.name, scene.name) for task, scene in held_out_pairs(suite)}
         assert not planned & held
         unclear = {UNCLEAR} if suite == "libero_spatial" else set()
         assert planned | held == {(pair.task.name, pair.scene.name) for pair in usable(suite)} - unclear
@@ -207,7 +207,7 @@ def test_tasks_that_share_a_start_begin_in_the_same_state() -> None:
     seed = GoalPerturbation(scene=scene.name, start=0, level=1).reset_seed
     starts = []
     for grocery in ("milk", "butter"):
-        environment = Environment(carried(find_task("libero_object", f"{PICK}{grocery}{BASKET}"), scene))
+        environment = Environment(carry(find_task("libero_object", f"{PICK}{grocery}{BASKET}"), scene))
         starts.append((environment.reset(seed), environment.state.tolist()))
         environment.close()
     assert starts[0] == starts[1]
@@ -245,7 +245,7 @@ def test_other_axes_perturb_the_task_in_its_scene() -> None:
         scene = find_task("libero_object", goal.scene)
         assert (row.task, row.instruction) == (task.name, language.text)
         assert {move.name for move in pose.moves} == set(bddl.read(scene.bddl_file).places)
-        assert changed_goal(row.instruction, carried(task, scene), hints=True) is None
+        assert changed_goal(row.instruction, carry(task, scene), hints=True) is None
         assert row.reset_seed == goal.reset_seed
 
 
@@ -289,7 +289,7 @@ def test_an_edited_scene_of_an_own_suite_gives_other_episodes(tmp_path: Path, mo
             assert edited != text
             (own / f"pack_{name}.bddl").write_text(text if folder == "before" or name == "milk" else edited)
         monkeypatch.chdir(tmp_path / folder)
-        for cached in (pairs, held_out):
+        for cached in (pairs, held_out_pairs):
             cached.cache_clear()
         task = find_task("kitchen", "pack_milk")
         entry = DemoEntry(task, "demo_0", "recorded", "human", "a" * 64, 100)
@@ -309,7 +309,7 @@ def test_disks_of_a_carried_task_are_those_of_its_scene() -> None:
     first, second = (next(task for task in tasks("libero_10") if f"ROOM_SCENE{k}_" in task.name) for k in (1, 2))
     for task, scene in ((first, second), (second, first)):
         farthest_m = {}
-        for played in (scene, carried(task, scene)):
+        for played in (scene, carry(task, scene)):
             sampled = [PoseAxis(components=("scene",), levels=(1,)).sample(rng("t", k), played, k) for k in range(200)]
             moves = [move for one in sampled if isinstance(one, ScenePerturbation) for move in one.moves]
             farthest_m[played.name] = max(float(np.hypot(move.dx_m, move.dy_m)) for move in moves)
@@ -342,7 +342,7 @@ def test_a_kept_replay_repeats_in_liberos_own_environment_of_the_scene(
     (entry,) = demos.index().entries
     (twin,) = plan.twins([entry], 0, settings)
     assert ReplayJob(twin, twin.trajectory_id, demos, settings, tmp_path)().kept
-    strength = level(demo.task, find_task(suite, scene))
+    strength = level_of_pair(demo.task, find_task(suite, scene))
     change = GoalPerturbation(scene=scene, start=0, level=strength)
     row = plan.build_row(entry, (change,), 0, settings)
     assert ReplayJob(row, twin.trajectory_id, demos, settings, tmp_path)().kept

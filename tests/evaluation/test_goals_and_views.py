@@ -10,7 +10,7 @@ import pytest
 from conftest import STOVE
 from episode_results import analyze, result
 
-from pipeline.axes.goal import GoalPerturbation, held_out
+from pipeline.axes.goal import GoalPerturbation, held_out_pairs
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
@@ -27,7 +27,7 @@ from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
-from pipeline.libero.carried import carried, definition_of
+from pipeline.libero.carried import carry, definition_of
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import plan
 from pipeline.types import Floats
@@ -90,13 +90,13 @@ def test_held_out_pairs_are_goals_of_their_scenes() -> None:
     carried_to = {(task.suite, task.base, task.name) for task in listed if CARRIED in task.name}
     expected = set()
     for suite in ("libero_spatial", "libero_10", "libero_90"):
-        for task, scene in held_out(suite):
+        for task, scene in held_out_pairs(suite):
             expected.add((suite, scene.name, f"{scene.name}_task_{task.name}_state0"))
     assert carried_to == expected
     assert len(expected) == 3
     replaced = {resolve_goal(task)[1] for task in listed if CARRIED not in task.name}
     assert not replaced & {resolve_goal(task)[1] for task in listed if CARRIED in task.name}
-    assert {definition_of(carried(task, scene)).asked for task, scene in held_out("libero_object")} <= replaced
+    assert {definition_of(carry(task, scene)).asked for task, scene in held_out_pairs("libero_object")} <= replaced
 
 
 def test_goals_that_a_plan_trains_on_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import ReplayConfig
 from pipeline.libero import bddl
-from pipeline.libero.task_goal import called, called_at_start, where
+from pipeline.libero.task_goal import describe_place, describe_thing, describe_thing_at_start
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
@@ -205,16 +205,19 @@ def test_each_task_has_words_for_its_goal() -> None:
     for suite in ("libero_spatial", "libero_object", "libero_goal", "libero_10"):
         for task in tasks(suite):
             known = bddl.read(task.bddl_file)
-            words = [called(known, name) for name in known.targets]
+            words = [describe_thing(known, name) for name in known.targets]
             assert len({*words}) == len(words), task.name
-            words += [word for fact in known.goal if len(fact) == 3 for word in where(known, fact)]
+            words += [word for fact in known.goal if len(fact) == 3 for word in describe_place(known, fact)]
             assert all(word.replace(" ", "").isalpha() and "place" not in word for word in words), task.name
 
 
 def words_of(suite: str, name: str) -> list[tuple[str, str, str, str]]:
     """Words of each goal: a thing, the thing at the start, the direction and the location of its place."""
     known = bddl.read(find_task(suite, name).bddl_file)
-    return [(called(known, fact[1]), called_at_start(known, fact[1]), *where(known, fact)) for fact in known.goal]
+    return [
+        (describe_thing(known, fact[1]), describe_thing_at_start(known, fact[1]), *describe_place(known, fact))
+        for fact in known.goal
+    ]
 
 
 def test_the_levels_of_a_shelf_have_their_own_words() -> None:
@@ -248,9 +251,9 @@ def test_the_side_of_another_thing_is_not_that_of_the_book() -> None:
     original = bddl.read(task.bddl_file)
     (book,) = original.targets
     two_books = replace(original, objects={**original.objects, "black_book_2": original.objects[book]})
-    assert called(two_books, book) == "the book"
+    assert describe_thing(two_books, book) == "the book"
     on_the_right = replace(two_books, language="pick up the book on the right and place it in the left compartment")
-    assert called(on_the_right, book) == "the right book"
+    assert describe_thing(on_the_right, book) == "the right book"
 
 
 def test_a_bowl_among_bowls_has_its_place_at_the_start() -> None:
@@ -261,8 +264,8 @@ def test_a_bowl_among_bowls_has_its_place_at_the_start() -> None:
         assert words_of(task.suite, task.name) == [("the black bowl", f"the {place}", "to the plate", "on the plate")]
     for task in tasks("libero_goal"):
         known = bddl.read(task.bddl_file)
-        assert [called_at_start(known, name) for name in known.targets] == [
-            called(known, name) for name in known.targets
+        assert [describe_thing_at_start(known, name) for name in known.targets] == [
+            describe_thing(known, name) for name in known.targets
         ]
 
 
