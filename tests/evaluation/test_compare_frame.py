@@ -70,7 +70,7 @@ def test_a_resizing_is_named(opened: LastStartFrames) -> None:
 
 
 @pytest.mark.slow
-def test_a_sheet_shows_picture_frame_and_difference_and_replaces_no_file(
+def test_a_sheet_shows_picture_frame_and_difference_and_replaces_no_file_of_the_user(
     opened: LastStartFrames, tmp_path: Path
 ) -> None:
     report: Report = frame_causes.reported(CASES["goal: rotated 180"], opened)
@@ -80,8 +80,11 @@ def test_a_sheet_shows_picture_frame_and_difference_and_replaces_no_file(
     assert np.array_equal(picture, frame_causes.frame("3.1.6-goal-agentview"))
     assert np.abs(picture.astype(int) - frame).mean() < 0.001
     assert apart.max() <= 4
-    with pytest.raises(PipelineError, match="exists"):
+    write_sheet(report, sheet)
+    sheet.write_bytes(b"mine")
+    with pytest.raises(PipelineError, match=r"sheet\.png: the command would overwrite the file"):
         write_sheet(report, sheet)
+    assert sheet.read_bytes() == b"mine"
 
 
 @pytest.mark.slow
