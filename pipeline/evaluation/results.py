@@ -126,7 +126,8 @@ class EpisodeFiles:
         lines = io.StringIO()
         writer = csv.writer(lines, lineterminator="\n")
         writer.writerow(TABLE)
-        writer.writerows([getattr(row, column) for column in TABLE] for row in rows)
+        for row in rows:
+            writer.writerow([getattr(row, column) for column in TABLE])
         outputs.write(self.table, lines.getvalue())
 
     def reject_other_folder(self) -> None:

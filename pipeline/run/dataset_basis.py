@@ -23,7 +23,7 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     Each episode has all rewrites that the run's language axis may sample for it. Without this axis, its default ranges
     decide.
     """
-    failures = "outcome" in target.content.extras
+    failures = target.content.is_of_failures
     rewrites: dict[str, tuple[str, ...]] = {}
     outcome, language = run.outcome, run.config.plan.axes.language
     facts: dict[str, EpisodeFacts] = {}

@@ -66,7 +66,7 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     notice_changes(target)
     reject_foreign(target, episodes)
     reject_edited(target)
-    if not episodes.ids and "outcome" in target.content.extras:
+    if not episodes.ids and target.content.is_of_failures:
         _move_aside(target, edited_to_move(target, target.record_file))
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
