@@ -161,7 +161,7 @@ def _reason_to_run(name: str, run: Run) -> str | None:
 
 def _stale_datasets(run: Run) -> dict[str, str]:
     """Map the stages ``export_<group>`` that would write a dataset again to the reasons."""
-    reasons: dict[str, str] = {}
+    reasons: dict[str, list[str]] = {}
     for dataset in (*run.formats, *(run.failure_formats if run.outcome.failures else ())):
         episodes = dataset_basis.episodes_of(dataset, run)
         changed_file = dataset_files.changed_file(dataset)
@@ -172,8 +172,9 @@ def _stale_datasets(run: Run) -> dict[str, str]:
             reason = f"the dataset has {next(iter(differences), 'files of other episodes or with other options')}"
         else:
             continue
-        reasons[f"export_{dataset.group}"] = f"{dataset.title}: {reason}"
-    return reasons
+        folder = dataset.folder.relative_to(run.folder)
+        reasons.setdefault(f"export_{dataset.group}", []).append(f"{folder}: {reason}")
+    return {name: "; ".join(of_stage) for name, of_stage in reasons.items()}
 
 
 def _generated_again(outdated_files: Mapping[str, Counter[str]], kind: str) -> str:

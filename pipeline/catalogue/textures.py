@@ -9,7 +9,7 @@ from typing import cast, get_args
 
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.texture_sources import Package, Source, Texture, kept, libero_images, offered
-from pipeline.errors import PipelineError
+from pipeline.errors import RUN_AGAIN, PipelineError
 from pipeline.files import checksum
 from pipeline.types import Frame
 
@@ -120,9 +120,9 @@ def find(name: str, sha256: str) -> Texture:
     if source in get_args(Package):
         texture = catalogue((cast(Package, source),)).get(name)
     if texture is None:
-        raise PipelineError(f"there is no texture {name}", remedy="run the plan stage again with this version")
+        raise PipelineError(f"there is no texture {name}", remedy=f"{RUN_AGAIN}, which plans again with this version")
     if texture.sha256 != sha256:
-        raise PipelineError(f"the texture {name} has changed since the plan", remedy="run the plan stage again")
+        raise PipelineError(f"the texture {name} has changed since the plan", remedy=f"{RUN_AGAIN}, which plans again")
     return texture
 
 

@@ -24,7 +24,7 @@ from rich.text import Text
 
 from pipeline.axes import Perturbation, from_json, task_of
 from pipeline.axes.base import Nearest
-from pipeline.errors import PipelineError
+from pipeline.errors import RUN_AGAIN, PipelineError
 from pipeline.files import write_json
 from pipeline.planning.plan import Row
 from pipeline.testset.benchmark import TestSet
@@ -262,5 +262,5 @@ def reject_overlap(findings: dict[str, AxisDistance]) -> None:
         raise PipelineError(
             f"planned episodes overlap with the benchmark's test tasks: {'; '.join(faults)}",
             expected="no overlap on any axis",
-            remedy="run the plan stage again, which samples overlapping perturbations again",
+            remedy=f"move the run's plan.parquet to another place, and {RUN_AGAIN}, which plans without overlaps",
         )

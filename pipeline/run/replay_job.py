@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.axes import PhysicsPerturbation, from_json, of_layer, task_of
 from pipeline.compute.pool import LOST
 from pipeline.config import DemosConfig, ReplayConfig
-from pipeline.errors import PipelineError
+from pipeline.errors import RUN_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.libero.carried import all_counterparts
 from pipeline.libero.starts import kept_actions
@@ -49,7 +49,7 @@ class ReplayJob:
                 "the demonstration has changed since the plan",
                 where=(self.demos.root or Path()) / demo.source,
                 expected=f"content with the hash {self.row.demo_sha256}",
-                remedy="restore the file, or run the plan stage again, which samples for the present content",
+                remedy=f"restore the file, or {RUN_AGAIN}, which plans again from the present content",
             )
         physics = of_layer(from_json(self.row.perturbations), PhysicsPerturbation)
         task = task_of(self.row.suite, self.row.task, self.row.perturbations)

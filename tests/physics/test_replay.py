@@ -138,7 +138,7 @@ def test_a_demonstration_that_changed_since_the_plan_is_rejected(short_demos: Pa
     file = root / STOVE.suite / f"{STOVE.name}_demo.hdf5"
     with h5py.File(file, "r+") as opened:
         opened["data/demo_0/actions"][0, 0] += 0.01
-    with pytest.raises(PipelineError, match=r"changed since the plan(?s:.*)run the plan stage again") as caught:
+    with pytest.raises(PipelineError, match=r"changed since the plan(?s:.*)which plans again") as caught:
         Replays(demos, ReplayConfig(), TrajectoryStore(tmp_path / "trajectories"), loop).complete(rows)
     assert f"{file} demo_0" in str(caught.value)
     assert not list(tmp_path.rglob("*.npz"))
