@@ -34,7 +34,9 @@ def from_6d(rotation: Array) -> Array:
 
 def main(run: Path) -> None:
     file = min((run / "lerobot").glob("*/data/*/*.parquet"))
-    action = np.array(pq.read_table(file, columns=["absolute_action"])["absolute_action"][0].as_py())
+    # With export.lerobot.action: absolute, the column `action` has the absolute actions.
+    column = "absolute_action" if "absolute_action" in pq.read_schema(file).names else "action"
+    action = np.array(pq.read_table(file, columns=[column])[column][0].as_py())
     position_m, axis_angle, gripper = action[:3], action[3:6], action[6:]
     six = to_6d(axis_angle[None])[0]
     print("axis-angle", action.round(4).tolist())

@@ -112,7 +112,7 @@ class PlanConfig(Frozen):
     seed: Annotated[int, Field(ge=-(2**63), lt=2**63), NO_TRUTH] = 0
     axes: Axes = Axes()
     episodes: dict[str, Count]
-    reserve: float = Field(default=0.5, ge=0.0, le=10.0)
+    reserve: Annotated[float, Field(ge=0.0, le=10.0), NO_TRUTH] = 0.5
     # Excluded at its default, as a field that was added later.
     task_weights: dict[str, Annotated[float, Field(gt=0.0, le=1000.0)]] = Field(
         default_factory=dict, exclude_if=lambda weights: not weights
@@ -185,7 +185,7 @@ class ReplayConfig(Frozen):
 
     mode: Literal["open_loop", "tracked", "auto"] = "auto"
     noops: Literal["drop", "trim_ends", "keep"] = "drop"
-    settle_steps: int = Field(default=SETTLING_STEPS, ge=0, le=200)
+    settle_steps: Annotated[int, Field(ge=0, le=200), NO_TRUTH] = SETTLING_STEPS
     fixture_seed: int = Field(default=0, ge=0, lt=2**32)
 
 

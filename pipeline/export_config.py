@@ -13,6 +13,7 @@ from pipeline.axes.component_names import ComponentName
 from pipeline.episode_schema import STANDARD, Content
 from pipeline.formats.base import Format, FormatOptions, Options
 from pipeline.formats.episodes import count_for_validation, too_few
+from pipeline.formats.lerobot import LeRobotOpenpi, LeRobotV21
 from pipeline.formats.registry import FORMATS
 from pipeline.types import Frozen
 
@@ -96,6 +97,15 @@ class ExportConfig(_Formats):
         if not self.formats:
             names = [kind.name for kind in FORMATS]
             raise ValueError(f"no format is left, expected one of {', '.join(names[:-1])} and {names[-1]}")
+        return self
+
+    @model_validator(mode="after")
+    def _no_format_twice(self) -> ExportConfig:
+        v21, openpi = self.options_for(LeRobotV21), self.options_for(LeRobotOpenpi)
+        if v21 is not None and openpi is not None and v21.convention == openpi.convention:
+            raise ValueError(
+                "lerobot_v21 with the convention openpi has the content of lerobot_openpi: remove one of them"
+            )
         return self
 
     @property

@@ -64,7 +64,7 @@ def _reject_truth(value: Any) -> Any:
         ValueError: if the value is one of them.
     """
     if isinstance(value, bool):
-        raise ValueError("expected a whole number")
+        raise ValueError("expected a number")
     return value
 
 

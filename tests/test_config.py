@@ -135,6 +135,12 @@ def test_every_field_is_described(model: type[BaseModel]) -> None:
         ("carrier pigeon", ("compute",), "compute"),
         ("my_set", ("export", "rlds", "name"), "export.rlds.name"),
         ("libero_aloha", ("export", "rlds", "name"), "a name with libero and without aloha in it"),
+        ({"name": "kitchen_val"}, ("export", "lerobot_openpi"), "names of sets for validation end in _val"),
+        (
+            {"lerobot_v21": {"convention": "openpi"}, "lerobot_openpi": {}},
+            ("export",),
+            "lerobot_v21 with the convention openpi has the content of lerobot_openpi",
+        ),
         (4, ("export", "lerobot", "parts"), "export.lerobot.parts: unknown field"),
         (0.6, ("export", "rlds", "validation"), "export.rlds.validation: expected at most 0.5, got 0.6"),
         (1e-320, ("export", "lerobot", "validation"), "export.lerobot.validation"),
@@ -411,7 +417,7 @@ def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest
 def test_true_is_no_number(fields: str, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text(f"name: mine\n{fields}")
-    with pytest.raises(PipelineError, match=r"plan\.(episodes\.camera|seed): expected a whole number \(got True\)"):
+    with pytest.raises(PipelineError, match=r"plan\.(episodes\.camera|seed): expected a number \(got True\)"):
         load(file)
 
 

@@ -50,7 +50,12 @@ class Instances:
         self.names: tuple[str, ...] = (*COMMON, *things, *added_names(resolved))
         rows = SCHEMA.object_poses.shape[0]
         if len(self.names) > rows:
-            raise PipelineError(f"a scene of {task.name} has {len(self.names)} things", expected=f"{rows} or fewer")
+            raise PipelineError(
+                f"a scene of {task.name} has {len(self.names)} things",
+                where="render.extras",
+                expected=f"{rows} or fewer",
+                remedy="leave out segmentation, boxes and object_poses, or plan fewer added objects for this task",
+            )
         goal_names: set[str] = set()
         for fact in problem.goal:
             goal_names.update(problem.things_named(fact[1:]))

@@ -280,6 +280,13 @@ class LeRobotV21Config(FormatOptions):
     convention: Literal["ipec", "openpi"]
     validation: ValidationShare = 0.0
 
+    def reject_name(self) -> None:
+        if self.name.endswith("_val"):
+            raise ValueError(
+                f"names of sets for validation end in _val, and so does the name {self.name!r} of a dataset in LeRobot "
+                "v2.1; expected another name"
+            )
+
 
 class LeRobotOpenpiConfig(LeRobotV21Config):
     """Options of the LeRobot dataset of version 2.1 for openpi.
