@@ -22,7 +22,7 @@ from pipeline.libero.aliases import as_defined
 from pipeline.libero.assets import package_folder, relocate
 from pipeline.libero.carried import task_named
 from pipeline.libero.recorder import reject_other_control, reject_other_rate
-from pipeline.libero.tasks import SUITES, base_of_test, find_task, suites, tasks
+from pipeline.libero.tasks import SUITES, base_of_test, find_task, suites_with, tasks
 from pipeline.origins import REINSTALL
 from pipeline.types import Demo, Floats, Task
 
@@ -319,7 +319,7 @@ class HDF5Source:
                     expected="recordings in scenes that the benchmark does not test",
                     remedy="leave its task out of demos.tasks: a policy that is trained on it cannot be tested",
                 )
-            suites_of_recorded = _suites_with(recorded)
+            suites_of_recorded = suites_with(recorded)
             if recorded != task.name and suites_of_recorded:
                 suite = task.suite if task.suite in suites_of_recorded else suites_of_recorded[0]
                 raise PipelineError(
@@ -473,11 +473,6 @@ class _Recorded(NamedTuple):
             states=all_states,
             model_xml=model_xml,
         )
-
-
-def _suites_with(name: str) -> list[str]:
-    """List the suites that have a task of this name."""
-    return [suite for suite in suites() if any(task.name == name for task in tasks(suite))]
 
 
 def _outside(data: h5py.Group, key: str, where: str) -> int:

@@ -86,6 +86,21 @@ def tasks(suite: str) -> tuple[Task, ...]:
     return own_tasks
 
 
+def suites_with(name: str) -> list[str]:
+    """List the suites that have a task of this name.
+
+    Files of own tasks are not read, as a faulty one must not stop commands about other suites.
+
+    Raises:
+        PipelineError: as ``suites``.
+    """
+    names = {suite: {task.name for task in _listed(suite)} for suite in SUITES}
+    for suite in suites():
+        if suite not in SUITES:
+            names[suite] = {file.stem for file in (OWN / suite).glob("*.bddl")}
+    return [suite for suite, of_suite in names.items() if name in of_suite]
+
+
 def _reject_unusable(task: Task) -> None:
     """Check the name and the instruction of an own task.
 

@@ -178,6 +178,22 @@ def test_a_recording_of_another_suites_task_is_sent_to_that_suite(root: Path) ->
     assert f"try: move the file to {root / 'libero_object' / milk}_demo.hdf5" in str(problem.error)
 
 
+def test_a_faulty_definition_of_an_own_task_costs_no_other_demonstration(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    faulty = tmp_path / "tasks" / "my_suite" / "half_written.bddl"
+    faulty.parent.mkdir(parents=True)
+    faulty.write_text("(define")
+    index = HDF5Source(root).index([TASK])
+    assert (len(index.entries), index.problems) == (11, [])
+    # Its name counts nevertheless.
+    with h5py.File(file_in(root), "r+") as file:
+        file["data"].attrs["bddl_file_name"] = "half_written.bddl"
+    (problem,) = HDF5Source(root).index([TASK]).problems
+    assert f"try: move the file to {root / 'my_suite' / 'half_written'}_demo.hdf5" in str(problem.error)
+
+
 def test_overwritten_bytes_never_raise_anything_else(root: Path) -> None:
     whole, rng = file_in(root).read_bytes(), np.random.default_rng(0)
     for _ in range(25):

@@ -71,6 +71,20 @@ def test_a_test_tasks_file_under_another_name_is_rejected(
     assert "bowl_down.bddl" in str(caught.value)
 
 
+@pytest.mark.parametrize("apostrophe", ["", "'", "\u2019"])
+def test_a_test_instruction_is_recognised_with_and_without_apostrophes(
+    apostrophe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    link_testset(tmp_path)
+    texts = [str(test.parameters["text"]) for test in benchmark.load().tasks if test.axis == "language"]
+    text = next(text for text in texts if " thats " in text)
+    spelled = text.replace(" thats ", f" that{apostrophe}s ")
+    definition = BOWL.bddl_file.read_text().replace("Put the bowl on the plate", spelled)
+    with pytest.raises(PipelineError, match="has the instruction of LIBERO-Plus's test task"):
+        planned(own_task(definition, tmp_path))
+
+
 def test_own_tasks_in_liberos_scenes_and_in_own_scenes_are_planned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
