@@ -46,7 +46,8 @@ class Selection(Frozen, use_attribute_docstrings=True):
     file: Path | None = None
     """list of tasks that ``analyze construct`` or ``analyze grade`` wrote, in place of a source"""
     suites: tuple[str, ...] = TESTED_SUITES
-    """only these suites, such as libero_goal; suites of the user's own tasks must be named"""
+    """only these suites, such as libero_goal; suites of the user's own tasks must be named, except with a list of
+    tasks, which is whole by default"""
     axes: tuple[str, ...] = ()
     """only these axes, which ``python -m pipeline axes`` lists"""
     components: tuple[ComponentName, ...] = ()
@@ -77,6 +78,9 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
             archive.
     """
     _check_names(selection)
+    if selection.file is not None and "suites" not in selection.model_fields_set:
+        # A list may have tasks of LIBERO-90 and of the user's suites.
+        selection = selection.model_copy(update={"suites": ()})
     source_tasks = list(_list_source_tasks(selection))
     if selection.source == "pairs":
         # Pairs are already restricted by axis and level. They include LIBERO's tasks, which have neither.

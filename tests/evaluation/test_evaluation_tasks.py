@@ -28,6 +28,7 @@ from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary, wilson
+from pipeline.evaluation.task_list import write_tasks
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states, libero_task
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task
@@ -298,6 +299,14 @@ def test_a_list_of_tasks_is_checked(tmp_path: Path) -> None:
     assert select(Selection(file=file)) == [task]
     with pytest.raises(PipelineError, match="expected: clean"):
         select(Selection(file=file, axes=("camera",)))
+
+
+def test_a_list_of_tasks_is_whole_unless_suites_are_named(tmp_path: Path) -> None:
+    listed = [select(Selection(suites=(suite,)))[0] for suite in (STOVE.suite, "libero_90")]
+    file = tmp_path / "tasks.json"
+    write_tasks(listed, 0, file)
+    assert select(Selection(file=file)) == listed
+    assert select(Selection(file=file, suites=("libero_90",))) == listed[1:]
 
 
 def test_an_environment_rejects_a_task_of_an_unknown_source_and_states_that_no_episode_has_begun() -> None:
