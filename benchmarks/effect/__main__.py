@@ -5,6 +5,8 @@
     nice -n 10 python benchmarks/effect evaluate ours 0    # 3. its results, in benchmarks/effect/results
     python benchmarks/effect table                         # 4. table and plot of docs/effect.md, of all results
 
+With `--experiment benchmarks/effect/further/axes.yaml`, the results are in `benchmarks/effect/further/results/axes`.
+
 Each step first runs the missing steps before it. Experiments with held-out perturbations need the plan of all arms for
 an evaluation. The first evaluation generates the data of all arms for it, and stores it in the folder of the results.
 After a stop, the same command resumes. Policies can be trained on different machines: the results of a policy are one
@@ -255,7 +257,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--experiment", type=Path, default=HERE / "experiment.yaml", help="another one")
     parser.add_argument("--out", type=Path, default=Path("data/effect"), help="folder of all files (data/effect)")
-    parser.add_argument("--results", type=Path, default=HERE / "results", help="folder of each policy's results")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        help="folder of each policy's results (results/ next to experiment.yaml, for another file results/<its name>)",
+    )
     steps = parser.add_subparsers(dest="step", required=True)
     for name in ("data", "train", "evaluate"):
         step = steps.add_parser(name)
@@ -270,12 +276,19 @@ def main() -> None:
         sys.exit(f"error: {error}")
 
 
+def results_folder(experiment: Path) -> Path:
+    """Return the folder of the results of an experiment's file, which no other file has."""
+    results = experiment.parent / "results"
+    return results if experiment.stem == "experiment" else results / experiment.stem
+
+
 def do(arguments: argparse.Namespace) -> None:
     """Run the step that the command line names."""
+    kept = arguments.results or results_folder(arguments.experiment)
     if arguments.step == "table":
         import comparison
 
-        print(comparison.publish(arguments.results))
+        print(comparison.publish(kept))
         return
     work = Work(read(arguments.experiment), arguments.out)
     match arguments.step:
@@ -284,7 +297,7 @@ def do(arguments: argparse.Namespace) -> None:
         case "train":
             work.train(arguments.arm, arguments.seed)
         case "evaluate":
-            print(f"wrote {work.evaluate(arguments.arm, arguments.seed, arguments.results)}: commit it")
+            print(f"wrote {work.evaluate(arguments.arm, arguments.seed, kept)}: commit it")
 
 
 if __name__ == "__main__":

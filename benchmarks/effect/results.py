@@ -95,14 +95,7 @@ def read(folder: Path) -> list[PolicyResults]:
         rows = [EpisodeResult(**common, **dict(zip(columns, row, strict=True))) for row in content.pop("rows")]
         policies.append(PolicyResults(**content, rows=rows))
         _reject_different(policies[0], policies[-1], policies[0].made_by(), file)
-        same_seed = next(policy for policy in policies if policy.seed == policies[-1].seed)
-        if policies[-1].precision != same_seed.precision:
-            raise PipelineError(
-                f"{policies[-1].arm} was trained in {policies[-1].precision}, and {same_seed.arm} in "
-                f"{same_seed.precision}, under the same seed",
-                where=file,
-                remedy="train both on processors of one kind",
-            )
+        _reject_other_precision(policies, policies[-1], file)
     if not policies:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")
     settings = policies[0].settings
@@ -117,11 +110,32 @@ def join(first: Sequence[PolicyResults], second: Sequence[PolicyResults], where:
         where: folder of the second experiment's results, for the message of an error.
 
     Raises:
-        PipelineError: if sentences, packages or versions differ.
+        PipelineError: if an arm is in both experiments, or if sentences, packages or versions differ, or the precision
+            under one seed.
     """
     for policy in second:
+        if policy.arm in {other.arm for other in first}:
+            raise PipelineError(
+                f"the arm {policy.arm} is in both compared experiments",
+                where=where,
+                expected="different arms",
+                remedy="move the results of this arm to another folder",
+            )
         _reject_different(first[0], policy, ("sentences", "packages", "packages of the training", "versions"), where)
+        _reject_other_precision(first, policy, where)
     return [*first, *second]
+
+
+def _reject_other_precision(others: Iterable[PolicyResults], policy: PolicyResults, where: Path) -> None:
+    """Raise a ``PipelineError`` if a policy and another one of its seed were trained with different precision."""
+    for other in others:
+        if other.seed == policy.seed and other.precision != policy.precision:
+            raise PipelineError(
+                f"{policy.arm} was trained in {policy.precision}, and {other.arm} in {other.precision}, under the same "
+                "seed",
+                where=where,
+                remedy="train both on processors of one kind",
+            )
 
 
 def _reject_different(first: PolicyResults, second: PolicyResults, names: Iterable[str], where: Path) -> None:

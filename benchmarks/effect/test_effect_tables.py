@@ -78,6 +78,18 @@ def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
             results.read(tmp_path)
 
 
+def test_experiments_are_joined_if_their_arms_differ_and_their_policies_were_trained_alike(tmp_path: Path) -> None:
+    clean, ours = of_policy("clean", 0, 4), of_policy("ours", 0, 9)
+    assert results.join([clean], [ours], tmp_path) == [clean, ours]
+    with pytest.raises(PipelineError, match="the arm clean is in both compared experiments"):
+        results.join([clean], [ours, of_policy("clean", 1, 4)], tmp_path)
+    in_float32 = replace(ours, made={"trained_with": {"precision": "float32"}})
+    with pytest.raises(PipelineError, match="ours was trained in float32, and clean in bfloat16, under the same seed"):
+        results.join([clean], [in_float32], tmp_path)
+    of_another_seed = replace(in_float32, seed=1)
+    assert results.join([clean], [of_another_seed], tmp_path) == [clean, of_another_seed]
+
+
 def test_rewrites_are_compared_with_liberos_instruction_from_the_same_states() -> None:
     """Four states, two seeds: three solved by one instruction alone, once by the rewrite."""
     by_rewrite = {0: (True, True, False, False), 1: (True, False, False, False)}
