@@ -25,11 +25,12 @@ from rich.progress import track
 from pipeline.catalogue import sweethome3d
 from pipeline.catalogue.meshes import RECIPE, convert, material_files
 from pipeline.catalogue.object_model import ObjectModel, asset_name
-from pipeline.catalogue.sources import Folder
+from pipeline.catalogue.sources import Folder, reject_undecodable
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, remove_leftovers, replaced
 from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.seeding import digest
+from pipeline.types import LONGEST_NAME
 
 Package = Literal["libero", "robosuite", "sweethome3d"]
 Source = Package | Folder
@@ -151,6 +152,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
             remedy="correct the folder in plan.axes.layout.sources",
         )
     for path in paths:
+        reject_undecodable(path)
         category = path.parent.name
         if not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)*", category):
             raise PipelineError(
@@ -162,7 +164,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         hashed = [(file.name, checksum(file)) for file in (path, *files_of[path])]
         made_from = digest("object", RECIPE, hashed)
         # The name holds a hash of the model's origin, so that an earlier plan still finds its own objects.
-        name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
+        name = f"own/{category}_{path.stem.lower()[:LONGEST_NAME]}_{made_from[:8]}"
         about = {"made_from": made_from, "category": category, "licence": source.licence}
         about["attribution"] = f"{category}/{path.name}" + (f" by {source.author}" if source.author else "")
         if _about(name) != about:

@@ -77,7 +77,7 @@ def _found(name: str, where: object) -> str:
             return installed(name)
         except ValueError as error:
             raise PipelineError(f"the scene uses {name}: {error}", where=where, remedy=REINSTALL) from error
-    below, _, sha256 = name.removeprefix(_OBJECTS).partition(_HASH)
+    below, _, sha256 = name.removeprefix(_OBJECTS).rpartition(_HASH)
     file = object_sources.FOLDER.resolve() / below
     if not file.is_file() or checksum(file) != sha256:
         raise PipelineError(

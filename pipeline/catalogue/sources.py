@@ -1,7 +1,10 @@
 """A user's folder as a source of textures or of object models."""
 
+from pathlib import Path
+
 from pydantic import Field
 
+from pipeline.errors import PipelineError
 from pipeline.types import Frozen, Place
 
 
@@ -20,3 +23,20 @@ class Folder(Frozen):
     licence: str = Field(min_length=1)
     # Excluded at its default, as a field that was added later.
     author: str = Field(default="", exclude_if=lambda author: not author)
+
+
+def reject_undecodable(file: Path) -> None:
+    """Reject a name that a plan cannot store.
+
+    Raises:
+        PipelineError: when the name is not UTF-8.
+    """
+    try:
+        str(file).encode()
+    except UnicodeEncodeError as error:
+        raise PipelineError(
+            f"the name {file.name!a} is not UTF-8",
+            where=file.parent,
+            expected="names of files and folders in UTF-8",
+            remedy="rename the file or its folder",
+        ) from error

@@ -21,7 +21,7 @@ from PIL import Image
 from pipeline import seeding
 from pipeline.catalogue import procedural
 from pipeline.catalogue.downloads import Wheel, fetch_wheel
-from pipeline.catalogue.sources import Folder
+from pipeline.catalogue.sources import Folder, reject_undecodable
 from pipeline.errors import PipelineError
 from pipeline.files import write
 from pipeline.libero.assets import libero_assets, package_folder
@@ -115,6 +115,7 @@ def offered(source: Source) -> Iterator[Texture]:
                 )
             for file in files:
                 texture = from_file("folder:", file, source.licence)
+                reject_undecodable(file)
                 name = f"folder:{texture.sha256[:8]}/{file.relative_to(source.folder).as_posix()}"
                 yield replace(texture, name=name, own=file, author=source.author)
         case "procedural":

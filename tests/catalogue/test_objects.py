@@ -17,7 +17,7 @@ import yaml
 from PIL import Image
 
 from pipeline.axes.layout import LayoutAxis
-from pipeline.catalogue import object_sources, sweethome3d
+from pipeline.catalogue import object_sources, scene_files, sweethome3d
 from pipeline.catalogue.meshes import convert
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Package, catalogue
@@ -234,6 +234,19 @@ def test_a_user_s_model_is_converted_once_and_again_when_its_texture_changes(
     assert after.sha256 != before.sha256
     # An earlier plan still finds what it was made with.
     assert find(before.name, before.sha256) == before
+
+
+@pytest.mark.parametrize("stem", ["x" * 240, "house#sha256=1"])
+def test_a_model_of_any_name_is_found_in_a_stored_scene(stem: str, folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine" / "toy_house"
+    write_house(mine, scale=0.01)
+    (mine / "house.obj").rename(mine / f"{stem}.obj")
+    ((_, model),) = models(own(tmp_path / "mine")).items()
+    assets, body = model.mjcf_of("thing")
+    stored = scene_files.portable(assets + body)
+    assert 'file="objects/own/' in stored
+    assert str(tmp_path) not in stored
+    assert scene_files.located(stored, "a trajectory") == assets + body
 
 
 def test_other_files_and_models_of_a_category_change_no_model(folder: Path, tmp_path: Path) -> None:

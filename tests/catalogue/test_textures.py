@@ -1,6 +1,7 @@
 """Textures: enough of them, distinct, with licence and hash, and none that the test set shows."""
 
 import hashlib
+import os
 import shutil
 import zipfile
 from collections import Counter
@@ -163,6 +164,7 @@ FAULTS = {
     "surface of a test task": "it has the name of an image that test tasks show",
     "normal map": "its name is that of a data map",
     "not an image": "the file is not a readable image",
+    "foreign letters": r"the name 'caf\\udce9.png' is not UTF-8",
     "empty": "the folder has no images",
     "missing": "there is no such folder",
 }
@@ -182,6 +184,9 @@ def test_a_folder_with_a_fault_is_an_error_that_names_it(tmp_path: Path, fault: 
             cv2.imwrite(str(folder / "wood_NRM_2K.png"), np.zeros((8, 8, 3), np.uint8))
         case "not an image":
             (folder / "mine.png").write_bytes(b"no image")
+        case "foreign letters":
+            encoded = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+            (folder / os.fsdecode(b"caf\xe9.png")).write_bytes(encoded)
     axis = BackgroundAxis(sources=(Folder(folder=folder, licence="CC0"),))
     with pytest.raises(PipelineError, match=f"{message}(?s:.*){fault}|{fault}(?s:.*){message}"):
         axis.offered()
