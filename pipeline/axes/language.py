@@ -359,6 +359,12 @@ def _shuffled(
     return rewrites
 
 
+def is_clear(text: str, component: Component, task: Task, test: TestSet) -> bool:
+    """Return whether a rewrite of a task keeps its clearance to the test instructions, so that plans use it."""
+    rewrite = LanguagePerturbation(component=component, text=text, level=level_of(text, task.instruction))
+    return rewrite.nearest(test, task).distance >= rewrite.clearance
+
+
 def level_of(text: str, original: str) -> Level:
     """Return the strength of a rewrite, by the ranges of ``LEVEL_STARTS``."""
     level: Level = get_args(Level)[bisect.bisect_right(LEVEL_STARTS, distance(text, original))]

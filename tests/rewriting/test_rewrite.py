@@ -145,6 +145,16 @@ def test_a_bank_from_good_answers(
     assert "secret" not in bank.read_text() + capsys.readouterr().out
 
 
+def test_a_sentence_that_plans_would_leave_out_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its distance to the test instruction "activate the cooktop" is below 0.2."""
+    answers = iter([SENTENCES[0], "activate the cooktop now", *SENTENCES[1:]])
+    bank = tmp_path / "bank.yaml"
+    rewrite.extend(STOVE.bddl_file, bank, 1, lambda question: json.dumps([next(answers)]))
+    assert counts(bank) == [1] * len(CLASSES)
+    assert "cooktop" not in bank.read_text()
+    assert "rejected: 1 x too close to a test instruction of LIBERO-Plus" in capsys.readouterr().out
+
+
 def test_the_question_says_what_is_in_the_scene_and_what_is_wanted(server: Server, tmp_path: Path) -> None:
     server.replies = lists(1, 1, 1, 1)
     rewrite.extend(STOVE.bddl_file, tmp_path / "bank.yaml", 1, ask(server))
