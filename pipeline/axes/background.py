@@ -184,7 +184,8 @@ class BackgroundAxis(Axis):
             contains ``procedural``; 0.7 by default, as in 751 of LIBERO-Plus's 1,076 background tests.
         image_share: Share of the other textures that are images instead of procedural colour maps; 0.3 by default.
         colour_scale: For each level, the share of the new texture's own average colour in the shown average colour.
-            At 0 a texture has the average colour of the replaced one. Perturbations in own colours ignore the field.
+            At 0 a texture has the average colour of the replaced one. Perturbations in own colours ignore the field. In
+            each case the shown average is kept within 40 to 205 grey levels.
     """
 
     kinds: ClassVar = (BackgroundPerturbation,)
