@@ -14,7 +14,7 @@ from pipeline import files
 from pipeline.errors import PipelineError
 
 RECORD = ".perturbed_libero.json"
-"""File with the SHA-256 of the last two contents of each file that a command wrote into the folder.
+"""File with the SHA-256 of the present and the next content of each file that a command writes into the folder.
 
 The checksum is recorded before the file is replaced. After a kill in between, the file has the content before it.
 """
@@ -52,8 +52,8 @@ def written(path: Path) -> Iterator[Path]:
     reject_other_file(path)
     with files.replaced(path) as temporary:
         yield temporary
-        recorded = _recorded(path.parent)
-        recorded[path.name] = [*recorded.get(path.name, [])[-1:], files.checksum(temporary)]
+        contents = [path, temporary] if path.exists() else [temporary]
+        recorded = _recorded(path.parent) | {path.name: [files.checksum(file) for file in contents]}
         files.write_json(path.parent / RECORD, recorded)
 
 

@@ -411,7 +411,9 @@ def perform(name: str, run: Run, title: str = "") -> None:
     Raises:
         PipelineError: when the stage stops.
     """
-    stage, reason = STAGES[name], why_not(name, run)
+    # A file that changes while the stage works must count as changed at the next call.
+    stage, memory = STAGES[name], _memory(name, run)
+    reason = _reason(stage, memory, run)
     if reason is None:
         print(f"{title or name}: up to date", flush=True)
         if stage.unchanged is not None:
@@ -422,18 +424,21 @@ def perform(name: str, run: Run, title: str = "") -> None:
         print(f"  reason: {reason}", flush=True)
     reject_foreign_files(run.folder)
     stage.work(run)
-    after = _memory(name, Run(run.config))
-    if after is not None:
-        after.keep()
+    if memory is not None:
+        memory.keep()
 
 
 def why_not(name: str, run: Run) -> str | None:
     """Describe why a stage has to work; `None` if its outputs are up to date."""
-    memory, changed_file = _memory(name, run), STAGES[name].changed_file
+    return _reason(STAGES[name], _memory(name, run), run)
+
+
+def _reason(stage: Stage, memory: Memory | None, run: Run) -> str | None:
+    """Describe why a stage with this memory has to work; `None` if its outputs are up to date."""
     reason = EVERY_TIME if memory is None else memory.why_not()
-    if reason is not None or changed_file is None:
+    if reason is not None or stage.changed_file is None:
         return reason
-    file = changed_file(run)
+    file = stage.changed_file(run)
     return None if file is None else finished.missing_or_changed(file, run.folder)
 
 

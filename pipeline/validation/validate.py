@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from itertools import chain
 from operator import call
@@ -36,6 +36,7 @@ from pipeline.run.progress import has_frames
 from pipeline.run.rewrites import list_episode_rewrites
 from pipeline.run.run import Run
 from pipeline.stores.frame_store import frames_by_trajectory
+from pipeline.types import Quality
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import compare_frames, compare_subtasks, witnesses
@@ -194,6 +195,7 @@ def _unlike_stores(run: Run) -> Iterator[Fault]:
     """
     try:
         trajectories, frames = run.trajectories.rows(), frames_by_trajectory(run.frames.rows())
+        verdicts = run.outcome.verdicts
     except PipelineError as error:
         yield Fault("frames", None, str(error), "the output of the run")
         return
@@ -205,9 +207,14 @@ def _unlike_stores(run: Run) -> Iterator[Fault]:
         twin = trajectories.get(trajectory_of[planned.twin_id], {})
         rendered = bool(replayed) and has_frames(planned, frames, run.config.render.content.views)
         path_m, twin_path_m = replayed.get("path_m"), twin.get("path_m")
+        verdict = verdicts[planned.episode_id]
         expected = {
+            "kept": verdict.kept,
+            "reason": verdict.reason,
             "steps": replayed.get("steps"),
             "replay_mode": replayed.get("mode"),
+            "resolved": replayed.get("resolved"),
+            **{each.name: replayed.get(each.name) for each in fields(Quality)},
             "path_ratio": path_m / twin_path_m if path_m is not None and twin_path_m else None,
             "gl_device": frames[planned.trajectory_id].device if rendered else None,
         }

@@ -135,9 +135,13 @@ def test_a_value_other_than_the_planned_one_is_found(column: str, other: object,
         (1, "replay_mode", "tracked"),
         (1, "path_ratio", 99.0),
         (1, "gl_device", "another"),
+        (1, "resolved", '{"pose": {}}'),
+        (1, "touched_steps", 1),
+        (1, "reason", "goal_lost"),
+        (0, "kept", False),
         (3, "steps", len(MADE)),
     ],
-    ids=["steps", "mode", "path", "device", "steps of a reserve without replay"],
+    ids=["steps", "mode", "path", "device", "scene", "touch", "reason", "kept", "steps of a reserve without replay"],
 )
 def test_results_other_than_the_stored_ones_are_found_also_of_a_dropped_row(
     row_number: int, column: str, other: object, tmp_path: Path
@@ -152,17 +156,19 @@ def test_results_other_than_the_stored_ones_are_found_also_of_a_dropped_row(
             streams[stream.stream_id] = MADE.frames[view]
     motion = (MADE.state, MADE.joint_state, MADE.action, MADE.action_absolute)
     run.frames.save(trajectory_id, Rendered("open_loop", *motion, streams), "llvmpipe")
+    results = {"gl_device": "llvmpipe", "steps": len(MADE), "replay_mode": "open_loop", "path_ratio": 1.0}
+    results |= {"resolved": "{}", **asdict(quality)}
     for row in rows:
         needed = row["reason"] == "kept"
-        row |= {"kept": needed, "chosen": True, "gl_device": "llvmpipe" if needed else None}
-        row |= {"steps": len(MADE), "replay_mode": "open_loop"} if needed else {"steps": None, "replay_mode": None}
-        row["path_ratio"] = 1.0 if needed else None
-    rows[1] |= {"kept": False, "reason": "goal_lost"}
+        row |= {"kept": needed, "chosen": True} | (results if needed else dict.fromkeys(results))
+    clean = {"where": {"level": [0]}}
+    for row in rows[1:3]:
+        row |= {"kept": False, "reason": "left_out"}
     write_manifest(tmp_path, rows)
-    assert list(_unlike_stores(run_in(tmp_path))) == []
+    assert list(_unlike_stores(run_in(tmp_path, export=clean))) == []
     rows[row_number][column] = other
     write_manifest(tmp_path, rows)
-    (fault,) = _unlike_stores(run_in(tmp_path))
+    (fault,) = _unlike_stores(run_in(tmp_path, export=clean))
     assert (fault.episode, fault.what) == (rows[row_number]["episode_id"], f"{column} is {other!r}")
 
 
