@@ -305,7 +305,8 @@ def print_counts(run: Run) -> None:
     rows, episodes = run.manifest, run.config.plan.episodes
     Console().print(counts.shown(rows, episodes))
     print(counts.Diversity.of(rows))
-    for sentence in (*counts.shortfalls(counts.targets(rows, episodes)), *counts.beyond_step_limit(rows)):
+    missing = counts.shortfalls(counts.targets(rows, episodes))
+    for sentence in (*missing, *counts.lost_to_workers(rows), *counts.beyond_step_limit(rows)):
         print(sentence)
 
 

@@ -107,5 +107,10 @@ def test_the_card_is_generated_again_after_every_change_that_it_records() -> Non
     assert sections("card") == {*inputs.PUBLISHED} == {*stages.STAGES["card"].settings}
 
 
+def test_the_report_is_generated_again_after_every_change_that_it_shows() -> None:
+    """It has the configuration of the run, and states nothing about publication."""
+    assert sections("report") == {*inputs.PUBLISHED} - {"publish"}
+
+
 def test_params_name_the_shipped_default() -> None:
     assert yaml.safe_load((REPOSITORY / "params.yaml").read_text()) == {"run": "starter", "data": "data"}

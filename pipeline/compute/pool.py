@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ ALONE_S = 30
 """Time to wait for a worker if none is left."""
 
 LOOK_S = 5
-"""Time between two checks for workers, while no work ends."""
+"""Time between two checks for workers."""
 
 LOST = "worker_lost"
 """Reason of an item that was dropped because no worker survives or finishes it."""
@@ -211,8 +212,13 @@ class _Workers:
         done: Queue[Future] = Queue()
         for future in futures:
             future.add_done_callback(done.put)
+        looked_s = time.monotonic()
         try:
             while numbers:
+                # While many workers work, items end all the time.
+                if time.monotonic() - looked_s >= LOOK_S:
+                    self.refill()
+                    looked_s = time.monotonic()
                 future = self._next(done)
                 if future.status == "error":
                     yield numbers.pop(future.key), future.exception()
@@ -228,6 +234,8 @@ class _Workers:
                     continue
                 except (CancelledError, CommClosedError, ConnectionError) as error:
                     raise self._lost("the Dask scheduler no longer answers") from error
+                # A worker that ends by itself would have to pass stored results on.
+                future.release()
                 yield numbers.pop(future.key), result
         finally:
             # A client whose scheduler has just died may still call itself running.

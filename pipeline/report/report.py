@@ -77,6 +77,7 @@ def page(run: Run, test: TestSet) -> str:
         diversity=yields.by_task(kept),
         shortfalls=[
             *counts.shortfalls(counts.targets(rows, config.plan.episodes)),
+            *counts.lost_to_workers(rows),
             *counts.beyond_step_limit(rows),
         ],
         axes=axes,

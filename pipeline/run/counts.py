@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from pipeline.compute.pool import LOST
 from pipeline.export_config import CLEAN
 from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import HUMAN
@@ -127,6 +128,19 @@ def shortfalls(found: Mapping[str, Target]) -> list[str]:
             remedy = "raise plan.reserve, which adds candidates; more similar ones may replace some kept episodes"
         sentences.append(f"{axis}: {target.kept} of {target.wanted} wanted episodes are kept; {remedy}")
     return sentences
+
+
+def lost_to_workers(rows: Rows) -> list[str]:
+    """Report the episodes that were dropped because workers ended over them; empty without such episodes."""
+    lost = [row for row in rows if row["reason"] == LOST]
+    if not lost:
+        return []
+    trajectories = named(lost, "trajectory_id")
+    return [
+        f"{len(lost)} episodes are dropped, because workers ended over them or they took too long ({LOST}); to try "
+        f"them again, move the files of {len(trajectories)} trajectories, such as {trajectories[0]}, out of "
+        "trajectories/ and frames/, and run the command again"
+    ]
 
 
 def beyond_step_limit(rows: Rows) -> list[str]:

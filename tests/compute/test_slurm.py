@@ -19,6 +19,7 @@ from distributed import Client
 from pydantic import ValidationError
 
 from pipeline.compute.pool import runner
+from pipeline.compute.slurm import seconds_of
 from pipeline.compute_config import JOB_GB, ComputeConfig, SlurmConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
@@ -111,6 +112,43 @@ def test_the_work_is_done_by_jobs_of_slurm_and_again_where_one_is_ended(slurm: P
         assert time.monotonic() < deadline, queued
         time.sleep(0.2)
     assert list((tmp_path / "data" / ".work" / "slurm").iterdir())
+
+
+def job_of_long(item: int) -> tuple[int, str]:
+    """Return in a worker, after some seconds, the item and the job that it runs in."""
+    time.sleep(3)
+    return item, os.environ["SLURM_JOB_ID"]
+
+
+@pytest.mark.slow
+def test_a_job_passes_its_work_on_before_its_walltime(
+    slurm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a single try, an item whose worker SLURM ended would end the run."""
+    monkeypatch.setattr("pipeline.compute.pool.TRIES", 1)
+    compute = ComputeConfig(cluster="slurm", workers=2, slurm=SlurmConfig(memory_gb=0.9, walltime="1"))
+    with runner(compute, tmp_path / "data") as work:
+        done = work(job_of_long, range(40), "long")
+    assert [item for item, _ in done] == list(range(40))
+    assert len({job for _, job in done}) > 2
+
+
+@pytest.mark.parametrize(
+    ("walltime", "seconds"),
+    [
+        ("30", 1800),
+        ("90:30", 5430),
+        ("12:00:00", 43_200),
+        ("2-12", 216_000),
+        ("2-12:30", 217_800),
+        ("1-00:00:05", 86_405),
+        ("UNLIMITED", None),
+        ("None", None),
+    ],
+)
+def test_a_walltime_is_read_as_slurm_reads_it(walltime: str, seconds: float | None) -> None:
+    """By the time formats of sbatch's manual."""
+    assert seconds_of(walltime) == seconds
 
 
 def scheduler_address(_: int) -> str:

@@ -12,7 +12,7 @@ from conftest import STAGES, run_stages
 from pipeline import status
 from pipeline.config import load
 from pipeline.run import manifest
-from pipeline.run.counts import Target, shortfalls, targets
+from pipeline.run.counts import Target, lost_to_workers, shortfalls, targets
 from pipeline.run.run import Run
 
 
@@ -42,6 +42,19 @@ def test_one_of_two_wanted_pose_episodes_is_a_shortfall() -> None:
     assert "plan.reserve" in pose
     assert light.startswith("light: 1 of 3 wanted episodes are kept")
     assert "plan.reserve" not in light, "no candidate is left that reserves could add"
+
+
+def test_episodes_that_workers_were_lost_over_are_reported_also_if_reserves_replace_them() -> None:
+    rows = [
+        row("clean", "worker_lost") | {"trajectory_id": "a"},
+        row("camera", "worker_lost") | {"trajectory_id": "a"},
+        row("robot", "worker_lost") | {"trajectory_id": "b"},
+        row("camera", "kept", wanted=False) | {"trajectory_id": "c"},
+    ]
+    (sentence,) = lost_to_workers(rows)
+    assert sentence.startswith("3 episodes are dropped")
+    assert "move the files of 2 trajectories, such as a, out of trajectories/ and frames/" in sentence
+    assert lost_to_workers(rows[3:]) == []
 
 
 def test_episodes_outside_the_dataset_are_neither_wanted_nor_kept() -> None:
