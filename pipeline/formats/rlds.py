@@ -50,7 +50,7 @@ class Rlds(Format[RldsConfig]):
     title: ClassVar = "RLDS"
     options_type: ClassVar = RldsConfig
     by_default: ClassVar = True
-    recipe: ClassVar = 9
+    recipe: ClassVar = 10
     packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
     splits_each_suite: ClassVar = True  # OpenVLA-OFT, when it validates, reads the split val of each set.
     card_facts = CardFacts(held_out_place="are the split `val` of each set that has this split.")
