@@ -18,10 +18,10 @@ QUANTILE_NAMES = ("q01", "q10", "q50", "q90", "q99")
 SAME_SHARE, SAME = 1e-4, 1e-6
 """Largest relative and absolute difference between stored statistics and those of the columns."""
 
-MEAN_LEVELS, DEVIATION = 25.0, 1.5
+MEAN_LEVELS, DEVIATION = 40.0, 2.0
 """Largest difference between an episode's three sampled frames and all of its frames: of the mean, in 255 levels, and
-of the deviation, as a quotient. In 47 episodes of ``configs/starter.yaml`` the largest were 10.0 and 1.12, in wrist
-views.
+of the deviation, as a quotient. In 685 views of libero_spatial and ``configs/starter.yaml`` the largest were 13.0 and
+1.29. The limits are far from these, as a run may have 56,000 views.
 """
 
 
