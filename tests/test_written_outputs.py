@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import outputs
+from pipeline import files, outputs
 from pipeline.errors import PipelineError
 
 
@@ -19,9 +19,9 @@ def stopped(path: Path, content: str, monkeypatch: pytest.MonkeyPatch) -> None:
         write_json(file, record)
         raise StoppedError
 
-    write_json = outputs.files.write_json
+    write_json = files.write_json
     with monkeypatch.context() as patch:
-        patch.setattr(outputs.files, "write_json", record_and_stop)
+        patch.setattr(files, "write_json", record_and_stop)
         with pytest.raises(StoppedError):
             outputs.write(path, content)
 
