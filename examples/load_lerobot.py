@@ -28,7 +28,7 @@ def main(run: Path) -> None:
         print(f"  episode 0, from step {start}: {text}")
     print(f"  episode 0 has {len(labels['rewrites'])} rewrites of its instruction")
     batch = next(iter(DataLoader(dataset, batch_size=4, shuffle=True)))
-    for name in ("observation.images.image", "observation.images.image2", "observation.state", "action"):
+    for name in (*dataset.meta.camera_keys, "observation.state", "action"):
         print(f"  {name}: {tuple(batch[name].shape)}")  # images are (N, 3, 256, 256), from 0 to 1
     for instruction in batch["task"]:
         print(f"  instruction: {instruction}")
