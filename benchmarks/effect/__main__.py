@@ -284,12 +284,12 @@ def results_folder(experiment: Path) -> Path:
 
 def do(arguments: argparse.Namespace) -> None:
     """Run the step that the command line names."""
-    kept = arguments.results or results_folder(arguments.experiment)
     if arguments.step == "table":
         import comparison
 
-        print(comparison.publish(kept))
+        print(comparison.publish(arguments.results or HERE / "results"))
         return
+    kept = arguments.results or results_folder(arguments.experiment)
     work = Work(read(arguments.experiment), arguments.out)
     match arguments.step:
         case "data":

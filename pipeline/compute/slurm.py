@@ -1,5 +1,6 @@
 """Workers as SLURM jobs, which wait in SLURM's queue until resources are free."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -28,6 +29,9 @@ LOOK_S = 5
 
 END_S = 300
 """Mean time before its walltime, or half of a shorter walltime, at which a worker passes its work on and ends."""
+
+_TIME = re.compile(r"(?:--time[= ]|-t[= ]?)\s*(.+)")
+"""Option of sbatch that sets the time limit."""
 
 LINES_SHOWN = 8
 """Number of last lines of a job's output in an error."""
@@ -193,34 +197,44 @@ def _cluster(compute_config: ComputeConfig, logs: Path, **security: Any) -> Any:
         log_directory=str(logs),
         python=dask.config.get("jobqueue.slurm.python", None) or quote(sys.executable),
         # SLURM limits memory itself.
-        worker_extra_args=[*_lifetime(job.walltime), *_of_site("worker-extra-args", "extra"), "--memory-limit", "0"],
+        worker_extra_args=[*_lifetime(job), *_of_site("worker-extra-args", "extra"), "--memory-limit", "0"],
         scheduler_options={"dashboard_address": "127.0.0.1:0", **_scheduler_of_site()},
         **security,
     )
 
 
-def _lifetime(walltime: str | None) -> list[str]:
+def _lifetime(job: SlurmConfig) -> list[str]:
     """Return options by which a worker ends before SLURM ends its job.
 
     Dask counts the end of a job against the item in work, as if the item had crashed the worker. A worker that ends by
     itself passes its work on. The times of the workers differ, so that not all of them end at once.
-
-    Args:
-        walltime: the run's; the site's by default.
     """
-    import dask
-
-    walltime_s = seconds_of(str(walltime or dask.config.get("jobqueue.slurm.walltime", None)))
+    walltime_s = seconds_of(time_limit(job))
     if walltime_s is None:
         return []
     before_s = min(END_S, walltime_s / 2)
     return ["--lifetime", f"{walltime_s - before_s:.0f}s", "--lifetime-stagger", f"{0.8 * before_s:.0f}s"]
 
 
+def time_limit(job: SlurmConfig) -> str:
+    """Return the time limit of a job: of the last further option that sets it, else ``walltime``; or no number."""
+    import dask
+
+    for option in reversed([*_of_site("job-extra-directives", "job-extra"), *job.options]):
+        stated = _TIME.fullmatch(option.strip())
+        if stated:
+            return stated[1]
+    if "-t" in _of_site("job-directives-skip", "header-skip"):
+        return "none"
+    return str(job.walltime or dask.config.get("jobqueue.slurm.walltime", None))
+
+
 def seconds_of(walltime: str) -> float | None:
     """Return a time limit as SLURM reads it, such as ``30``, ``12:00:00`` or ``2-12``; `None` for no limit."""
     days, dash, clock = walltime.rpartition("-")
     parts = clock.split(":")
+    if dash and not days:  # SLURM reads -1 as no limit.
+        return None
     if not all(part.isdecimal() for part in (*parts, days or "0")) or len(parts) > 3:
         return None
     first_unit = 0 if dash or len(parts) == 3 else 1

@@ -34,7 +34,7 @@ from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.setting_checks import check_settings
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.libero.tasks import suites
+from pipeline.libero.tasks import SUITES, suites
 from pipeline.machine_code import ensure_fixed_machine_code
 
 ACTION = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
@@ -168,12 +168,14 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def get_metadata(self) -> dict[str, Any]:
         """Return the metadata; ``max_steps`` is the largest limit, but each episode ends at its own suite's limit."""
-        named = self._selection.suites if self._selection.file is None else suites()
+        settings = self._environment.settings
+        # A list of tasks names no suites. Own suites have a limit only if the settings state it.
+        named = self._selection.suites or (SUITES if settings.own_step_limit is None else suites())
         return {
-            "max_steps": max(map(self._environment.settings.step_limit, named)),
+            "max_steps": max(map(settings.step_limit, named)),
             "max_episodes_per_task": 1,
             "selection": self._selection.model_dump(mode="json"),
-            "settings": self._environment.settings.model_dump(mode="json"),
+            "settings": settings.model_dump(mode="json"),
         }
 
     def get_action_spec(self) -> dict[str, DimSpec]:

@@ -8,7 +8,7 @@ from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from pipeline.axes import AXES, axes_of, level_of_test
 from pipeline.axes.base import LEVELS
@@ -64,6 +64,14 @@ class Selection(Frozen, use_attribute_docstrings=True):
     seed: int = 0
     """seed of the subset and of all perturbations"""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _a_list_is_whole(cls, values: Any) -> Any:
+        """Name no suites by default with a list, which may have tasks of LIBERO-90 and of the user's suites."""
+        if isinstance(values, dict) and values.get("file") is not None:
+            return {"suites": (), **values}
+        return values
+
     @field_validator("suites", "axes", "components", "levels", "tasks")
     @classmethod
     def _each_once(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -78,9 +86,6 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
             archive.
     """
     _check_names(selection)
-    if selection.file is not None and "suites" not in selection.model_fields_set:
-        # A list may have tasks of LIBERO-90 and of the user's suites.
-        selection = selection.model_copy(update={"suites": ()})
     source_tasks = list(_list_source_tasks(selection))
     if selection.source == "pairs":
         # Pairs are already restricted by axis and level. They include LIBERO's tasks, which have neither.

@@ -139,7 +139,7 @@ def lost_to_workers(rows: Rows) -> list[str]:
     return [
         f"{len(lost)} episodes are dropped, because workers ended over them or they took too long ({LOST}); to try "
         f"them again, move the files of {len(trajectories)} trajectories, such as {trajectories[0]}, out of "
-        "trajectories/ and frames/, and run the command again"
+        "trajectories/ and frames/, and run the command again; for a clean twin, move all files of its demonstration"
     ]
 
 

@@ -19,7 +19,7 @@ from distributed import Client
 from pydantic import ValidationError
 
 from pipeline.compute.pool import runner
-from pipeline.compute.slurm import seconds_of
+from pipeline.compute.slurm import seconds_of, time_limit
 from pipeline.compute_config import JOB_GB, ComputeConfig, SlurmConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
@@ -143,12 +143,24 @@ def test_a_job_passes_its_work_on_before_its_walltime(
         ("2-12:30", 217_800),
         ("1-00:00:05", 86_405),
         ("UNLIMITED", None),
+        ("-1", None),
         ("None", None),
     ],
 )
 def test_a_walltime_is_read_as_slurm_reads_it(walltime: str, seconds: float | None) -> None:
     """By the time formats of sbatch's manual."""
     assert seconds_of(walltime) == seconds
+
+
+def test_the_time_limit_is_that_of_the_option_that_sbatch_reads_last() -> None:
+    """dask-jobqueue writes further options after its own one."""
+    assert time_limit(SlurmConfig(walltime="1")) == "1"
+    assert time_limit(SlurmConfig(walltime="1", options=("--time=12:00:00", "--time-min=5"))) == "12:00:00"
+    with site("job-extra-directives: ['-t 2-0']"):
+        assert time_limit(SlurmConfig(walltime="1")) == "2-0"
+        assert time_limit(SlurmConfig(options=("-t30",))) == "30"
+    with site("job-directives-skip: ['-t']"):
+        assert seconds_of(time_limit(SlurmConfig(walltime="1"))) is None
 
 
 def scheduler_address(_: int) -> str:

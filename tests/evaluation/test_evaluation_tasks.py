@@ -22,6 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
 from pipeline.evaluation.analyses.grading import grade
 from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.harness import PerturbedLibero
 from pipeline.evaluation.held_out import sample_perturbation
 from pipeline.evaluation.libero_plus import moved_state, saved_array
 from pipeline.evaluation.policies import Wanted
@@ -31,7 +32,7 @@ from pipeline.evaluation.statistics import summary, wilson
 from pipeline.evaluation.task_list import write_tasks
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states, libero_task
 from pipeline.libero.starts import HOME_RAD
-from pipeline.libero.tasks import SUITES, find_task
+from pipeline.libero.tasks import STEP_LIMITS, SUITES, find_task
 from pipeline.testset import benchmark
 
 
@@ -305,8 +306,11 @@ def test_a_list_of_tasks_is_whole_unless_suites_are_named(tmp_path: Path) -> Non
     listed = [select(Selection(suites=(suite,)))[0] for suite in (STOVE.suite, "libero_90")]
     file = tmp_path / "tasks.json"
     write_tasks(listed, 0, file)
-    assert select(Selection(file=file)) == listed
+    whole = Selection(file=file)
+    assert whole.suites == ()
+    assert select(whole) == listed
     assert select(Selection(file=file, suites=("libero_90",))) == listed[1:]
+    assert PerturbedLibero({"file": str(file)}).get_metadata()["max_steps"] == max(STEP_LIMITS.values())
 
 
 def test_an_environment_rejects_a_task_of_an_unknown_source_and_states_that_no_episode_has_begun() -> None:
