@@ -26,7 +26,7 @@ class SlurmConfig(Frozen):
         partition: Partition of the site; by default the site's own setting.
         account: Account of the site; by default the site's own setting.
         walltime: Time limit of a worker's job, such as ``"12:00:00"``; by default the site's own setting. The worker
-            ends up to ten minutes before, and another worker repeats its unfinished work.
+            ends some minutes before, and another worker repeats its unfinished work.
         memory_gb: Memory of a worker in GB; by default the site's ``job-mem``, or 6 GB without it.
         options: Further options of ``sbatch``, such as ``--gres=gpu:1``, added to the site's ``job-extra-directives``;
             none by default.

@@ -113,8 +113,9 @@ def join(first: Sequence[PolicyResults], second: Sequence[PolicyResults], where:
         PipelineError: if an arm is in both experiments, or if sentences, packages or versions differ, or the precision
             under one seed.
     """
+    arms = {policy.arm for policy in first}
     for policy in second:
-        if policy.arm in {other.arm for other in first}:
+        if policy.arm in arms:
             raise PipelineError(
                 f"the arm {policy.arm} is in both compared experiments",
                 where=where,

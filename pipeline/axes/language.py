@@ -77,6 +77,10 @@ class LanguagePerturbation(TextPerturbation):
             return nearest._replace(distance=0.0)
         return nearest
 
+    def is_clear(self, test: TestSet, task: Task) -> bool:
+        """Return whether the rewrite keeps its clearance to the test instructions, so that plans use it."""
+        return self.nearest(test, task).distance >= self.clearance
+
     def observe(self, episode: ObservedEpisode) -> Iterator[tuple[str, float]]:
         """Count the words of the instruction."""
         yield "words in the instruction", len(episode.instruction.split())
@@ -176,7 +180,7 @@ class LanguageAxis(Axis):
         texts = []
         components = self._select_components(other_objects=other_objects)
         for rewrite in _find_rewrites(task, components, self.levels, self.bank):
-            if rewrite.nearest(test, task).distance >= rewrite.clearance:
+            if rewrite.is_clear(test, task):
                 texts.append(rewrite.text)
         return tuple(texts)
 
@@ -352,17 +356,15 @@ def _shuffled(
     order = seeding.rng("language", task.suite, task.name, component).permutation(len(texts))
     rewrites = []
     for index in order:
-        text = texts[index]
-        level = level_of(text, task.instruction)
-        if level in levels:
-            rewrites.append(LanguagePerturbation(component=component, text=text, level=level))
+        rewrite = rewrite_of(task, component, texts[index])
+        if rewrite.level in levels:
+            rewrites.append(rewrite)
     return rewrites
 
 
-def is_clear(text: str, component: Component, task: Task, test: TestSet) -> bool:
-    """Return whether a rewrite of a task keeps its clearance to the test instructions, so that plans use it."""
-    rewrite = LanguagePerturbation(component=component, text=text, level=level_of(text, task.instruction))
-    return rewrite.nearest(test, task).distance >= rewrite.clearance
+def rewrite_of(task: Task, component: Component, text: str) -> LanguagePerturbation:
+    """Return the perturbation that rewords a task's instruction as ``text``."""
+    return LanguagePerturbation(component=component, text=text, level=level_of(text, task.instruction))
 
 
 def level_of(text: str, original: str) -> Level:

@@ -192,7 +192,7 @@ def _cluster(compute_config: ComputeConfig, logs: Path, **security: Any) -> Any:
         queue=job.partition,
         account=job.account,
         walltime=job.walltime,
-        job_extra_directives=[*_of_site("job-extra-directives", "job-extra"), *job.options],
+        job_extra_directives=_further_options(job),
         job_script_prologue=[*_of_site("job-script-prologue", "env-extra"), environment],
         log_directory=str(logs),
         python=dask.config.get("jobqueue.slurm.python", None) or quote(sys.executable),
@@ -217,10 +217,13 @@ def _lifetime(job: SlurmConfig) -> list[str]:
 
 
 def time_limit(job: SlurmConfig) -> str:
-    """Return the time limit of a job: of the last further option that sets it, else ``walltime``; or no number."""
+    """Return the time limit of a job: of the last further option that sets it, else ``walltime``; or no number.
+
+    dask-jobqueue writes further options after ``walltime``, and sbatch uses the last one.
+    """
     import dask
 
-    for option in reversed([*_of_site("job-extra-directives", "job-extra"), *job.options]):
+    for option in reversed(_further_options(job)):
         stated = _TIME.fullmatch(option.strip())
         if stated:
             return stated[1]
@@ -240,6 +243,11 @@ def seconds_of(walltime: str) -> float | None:
     first_unit = 0 if dash or len(parts) == 3 else 1
     units_s = (3600, 60, 1)[first_unit:]
     return 86400.0 * int(days or 0) + sum(unit_s * int(part) for unit_s, part in zip(units_s, parts, strict=False))
+
+
+def _further_options(job: SlurmConfig) -> list[str]:
+    """List the options of ``sbatch`` that the site and the run add."""
+    return [*_of_site("job-extra-directives", "job-extra"), *job.options]
 
 
 def _of_site(name: str, former_name: str) -> list[str]:

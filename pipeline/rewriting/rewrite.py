@@ -16,7 +16,7 @@ import yaml
 from jinja2 import StrictUndefined, Template
 from pydantic import TypeAdapter
 
-from pipeline.axes.language import Bank, is_clear, load_bank, read_bank
+from pipeline.axes.language import Bank, load_bank, read_bank, rewrite_of
 from pipeline.axes.language_copies import copies_test
 from pipeline.axes.language_lint import CLASSES, LENGTH, REMEDY, Component, lint, normalise
 from pipeline.errors import PipelineError
@@ -172,7 +172,7 @@ def _sift(
             fault = "a repetition"
         if not fault and copies_test(text, benchmark.load(), task):
             fault = "a copy of a test instruction of LIBERO-Plus"
-        if not fault and not is_clear(text, component, task, benchmark.load()):
+        if not fault and not rewrite_of(task, component, text).is_clear(benchmark.load(), task):
             fault = "too close to a test instruction of LIBERO-Plus"
         if fault:
             reasons[fault] += 1

@@ -237,7 +237,9 @@ def test_a_user_s_model_is_converted_once_and_again_when_its_texture_changes(
 
 
 @pytest.mark.parametrize("stem", ["x" * 240, "house#sha256=1"])
-def test_a_model_of_any_name_is_found_in_a_stored_scene(stem: str, folder: Path, tmp_path: Path) -> None:
+def test_a_model_with_a_long_name_or_a_mark_in_it_is_found_in_a_stored_scene(
+    stem: str, folder: Path, tmp_path: Path
+) -> None:
     mine = tmp_path / "mine" / "toy_house"
     write_house(mine, scale=0.01)
     (mine / "house.obj").rename(mine / f"{stem}.obj")

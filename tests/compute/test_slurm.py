@@ -152,8 +152,7 @@ def test_a_walltime_is_read_as_slurm_reads_it(walltime: str, seconds: float | No
     assert seconds_of(walltime) == seconds
 
 
-def test_the_time_limit_is_that_of_the_option_that_sbatch_reads_last() -> None:
-    """dask-jobqueue writes further options after its own one."""
+def test_the_time_limit_is_that_of_the_last_further_option() -> None:
     assert time_limit(SlurmConfig(walltime="1")) == "1"
     assert time_limit(SlurmConfig(walltime="1", options=("--time=12:00:00", "--time-min=5"))) == "12:00:00"
     with site("job-extra-directives: ['-t 2-0']"):
