@@ -1,26 +1,35 @@
 """How often a client samples a step, by the command, weights and words that ``finetune.yaml`` gives."""
 
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
+from accelerate import Accelerator
 from conftest import datasets_in
 from tiny_recipe import ROWS, export_config, row, tiny_recipe
+from torch.utils.data import DataLoader, Dataset
 
 from pipeline.clients.recipe import write
 from pipeline.export_config import ExportConfig
 
 
-def test_starvla_samples_every_step_equally_often(tmp_path: Path) -> None:
-    """By its own rule (``LeRobotMixtureDataset``, 0ed0aad): a set, an episode of it, a step of that."""
+def _options_of_starvla(folder: Path) -> dict[str, Any]:
+    """Data options by name, from the command."""
     export = export_config(lerobot_v21={"name": "tiny", "convention": "ipec"})
-    words = tiny_recipe(tmp_path, export)["clients"]["starvla"]["command"].split()
-    given = {
-        name: yaml.safe_load(words[words.index(f"--datasets.vla_data.{name}") + 1])
-        for name in ("balance_dataset_weights", "balance_trajectory_weights")
-        if f"--datasets.vla_data.{name}" in words
+    words = tiny_recipe(folder, export)["clients"]["starvla"]["command"].split()
+    prefix = "--datasets.vla_data."
+    return {
+        word.removeprefix(prefix): yaml.safe_load(value) for word, value in pairwise(words) if word.startswith(prefix)
     }
+
+
+def test_starvla_samples_every_step_with_equal_probability(tmp_path: Path) -> None:
+    """By its own rule (``LeRobotMixtureDataset``, 0ed0aad): a set, an episode of it, a step of that."""
+    given = _options_of_starvla(tmp_path)
     sets = [np.array([100, 120]), np.array([80, 300, 90, 110, 200])]
     of_sets = np.ones(2)
     if given.get("balance_dataset_weights", False):
@@ -32,6 +41,31 @@ def test_starvla_samples_every_step_equally_often(tmp_path: Path) -> None:
             of_episodes *= lengths
         probabilities += list(share * of_episodes / of_episodes.sum() / lengths)
     np.testing.assert_allclose(probabilities, 1 / 1000, rtol=1e-12)
+
+
+class _SampledSteps(Dataset[int]):
+    """Like ``LeRobotMixtureDataset``: the sampled step depends on the pass that it was told, and on the index."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return 100
+
+    def __getitem__(self, index: int) -> int:
+        return int(np.random.default_rng((self.epoch, index)).integers(100))
+
+
+def test_starvla_samples_other_steps_in_each_pass(tmp_path: Path) -> None:
+    """Only accelerate tells the data set the pass, in the main process, before it asks for an iterator."""
+    persistent = _options_of_starvla(tmp_path).get("persistent_workers", True)  # its default (dataloader/__init__.py)
+    loader = DataLoader(_SampledSteps(), batch_size=10, num_workers=1, persistent_workers=persistent)
+    prepared = Accelerator(cpu=True).prepare(loader)
+    first, second = (torch.cat(list(prepared)).tolist() for _ in range(2))
+    assert first != second
 
 
 @pytest.mark.parametrize(("split", "about"), [("train", False), ("val", True)])

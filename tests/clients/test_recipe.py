@@ -104,7 +104,7 @@ def test_a_run_of_both_conventions_has_all_clients(tmp_path: Path) -> None:
     assert recipe["clients_of_other_formats"].keys() == {"robomimic"}
     assert "$DATA/lerobot_openpi " in recipe["clients"]["openpi"]["command"]
     assert "--datasets.vla_data.data_root_dir lerobot_v21 " in recipe["clients"]["starvla"]["command"]
-    assert "cp -rs $DATA/lerobot_v21 lerobot_v21`" in recipe["clients"]["starvla"]["where"]
+    assert "test ! -e lerobot_v21 && cp -rs $DATA/lerobot_v21 lerobot_v21`" in recipe["clients"]["starvla"]["where"]
     named = [client for dataset in export.datasets(tmp_path) for client in dataset.clients]
     assert sorted(named) == sorted(recipe["clients"])
 
