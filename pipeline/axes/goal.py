@@ -181,10 +181,13 @@ class GoalAxis(Axis):
         """List the names of the scenes to which the task is carried, of the configured levels."""
         return [scene.name for scene in _trained(task) if level_of_pair(task, scene) in self.levels]
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> GoalPerturbation:
-        """Return the scene at ``place`` of ``entries``, which start again at their end, with one of its starts."""
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> GoalPerturbation:
+        """Return the scene at ``entry_index`` of ``entries``, with one of its starts.
+
+        The list of entries starts again at its end.
+        """
         scenes = self.entries(task)
-        scene = find_task(task.suite, scenes[place % len(scenes)])
+        scene = find_task(task.suite, scenes[entry_index % len(scenes)])
         start = int(rng.integers(self.starts))
         sha256 = "" if scene.suite in SUITES else checksum(scene.bddl_file)
         return GoalPerturbation(scene=scene.name, start=start, level=level_of_pair(task, scene), scene_sha256=sha256)

@@ -175,7 +175,7 @@ class LightAxis(Axis):
         _range((0.05, 0.25), (1.85, 2.0), (0.53, 0.65), (17, 30), (26, 32), (0.0, 0.06)),
     )
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LightPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> LightPerturbation:
         component, level = self._sample_component(rng), self.sample_level(rng)
         # Sampled for every component: stored plans depend on the number of samples.
         casts_shadows = rng.random() < 0.5

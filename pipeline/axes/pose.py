@@ -455,11 +455,11 @@ class PoseAxis(Axis):
         """Return whether no scene has level 5 for LIBERO-Plus's places."""
         return self.benchmark_places == 0 or 5 not in self.levels or not _benchmark_shifts_m(task)
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
-        return self.sample_after(rng, task, place, ())
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> PosePerturbation | ScenePerturbation:
+        return self.sample_after(rng, task, entry_index, ())
 
     def sample_after(
-        self, rng: np.random.Generator, task: Task, place: int, earlier: Sequence[Perturbation]
+        self, rng: np.random.Generator, task: Task, entry_index: int, earlier: Sequence[Perturbation]
     ) -> PosePerturbation | ScenePerturbation:
         movable = self._movable(task)
         component = pick(rng, [component for component in self.components if component in movable])

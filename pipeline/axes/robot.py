@@ -179,7 +179,7 @@ class RobotAxis(Axis):
         """Return the level by the norm of the offset, 0.1 rad for each level."""
         return level_from(float(tested.parameters["id"]) / 100)
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> RobotPerturbation:
         level = self.sample_level(rng)
         component = pick(rng, self.components)
         direction = rng.standard_normal(7)
