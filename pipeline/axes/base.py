@@ -137,8 +137,8 @@ class Perturbation(Frozen):
         """Return this change without the parts that the scene of ``task`` does not show, for descriptions."""
         return self
 
-    def played(self, task: Task) -> Task:
-        """Return the task whose goal and scene an episode of ``task`` has with this change."""
+    def carry(self, task: Task) -> Task:
+        """Return ``task`` carried to the scene of this change; by default ``task``, in its own scene."""
         return task
 
     @property

@@ -141,7 +141,7 @@ class Sampler:
             entry_index = indices[attempt % len(indices)]
             perturbation = axis.sample_after(random, task, entry_index, earlier)
             choices.append(_Choice(axis, task, earlier, entry_index, perturbation))
-            task = perturbation.played(task)
+            task = perturbation.carry(task)
             if perturbation.reset_seed is not None:
                 earlier = ()
         return choices
