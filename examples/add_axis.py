@@ -40,7 +40,7 @@ class LensAxis(Axis):
 
     kinds: ClassVar = (LensPerturbation,)
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LensPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> LensPerturbation:
         level = self.sample_level(rng)
         return LensPerturbation(level=level, fovy_scale=round(1 - 0.06 * (level - rng.random()), 4))
 

@@ -87,8 +87,8 @@ def at_own_place(suite: str, scene: str, asked: str) -> bool:
         asked: name of the task that is carried to the scene.
     """
     task = find_task(suite, asked)
-    own, played = definition_of(task), definition_of(carry(task, find_task(suite, scene)))
-    apart_m = np.subtract(own.centres_m[own.targets[0]], played.centres_m[played.targets[0]])
+    own, carried = definition_of(task), definition_of(carry(task, find_task(suite, scene)))
+    apart_m = np.subtract(own.centres_m[own.targets[0]], carried.centres_m[carried.targets[0]])
     return bool(np.linalg.norm(apart_m) < SAME_PLACE_M)
 
 
@@ -97,6 +97,6 @@ def goals_in(scene: Task, tasks: Sequence[Task]) -> dict[str, tuple[Fact, ...]]:
     goals: dict[str, tuple[Fact, ...]] = {}
     for instruction in instructions_in(scene, tasks):
         if instruction.asked:
-            played = instruction.asked if instruction.kind == "own" else carry(instruction.asked, scene)
-            goals[instruction.asked.name] = definition_of(played).goal
+            task = instruction.asked if instruction.kind == "own" else carry(instruction.asked, scene)
+            goals[instruction.asked.name] = definition_of(task).goal
     return goals

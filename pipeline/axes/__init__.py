@@ -110,13 +110,13 @@ def task_of(suite: str, name: str, perturbations: str) -> Task:
     Args:
         perturbations: JSON list, as in the columns of the plan and the manifest.
     """
-    return played_task(find_task(suite, name), from_json(perturbations))
+    return carried_task(find_task(suite, name), from_json(perturbations))
 
 
-def played_task(task: Task, perturbations: Iterable[Perturbation]) -> Task:
+def carried_task(task: Task, perturbations: Iterable[Perturbation]) -> Task:
     """Return the task that an episode of ``task`` with these perturbations carries out."""
     for perturbation in perturbations:
-        task = perturbation.played(task)
+        task = perturbation.carry(task)
     return task
 
 

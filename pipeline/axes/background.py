@@ -204,7 +204,7 @@ class BackgroundAxis(Axis):
         """Return whether no perturbation has level 5 for its textures' own colours."""
         return self.own_colours == 0 or 5 not in self.levels
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> BackgroundPerturbation:
         component = pick(rng, self.components)
         level = self.sample_level(rng)
         own_colours = rng.random() < self.own_colours and 5 in self.levels

@@ -2,7 +2,7 @@
 
 An axis is a pair of small frozen models in one file. Their class attributes hold the constants of the axis:
 
-* ``XAxis`` holds the configured ranges and samples from them: ``sample(rng, task, place) -> XPerturbation``.
+* ``XAxis`` holds the configured ranges. ``sample(rng, task, entry_index)`` samples an ``XPerturbation`` from them.
 * ``XPerturbation`` is one sampled change with every parameter. Its ``apply(...)`` changes the object of its layer
   (text: the instruction; pixels: a clean frame; render: the MuJoCo model; physics: the scene and its rollout settings).
 
@@ -109,7 +109,7 @@ class Perturbation(Frozen):
         """
         distances = np.full(len(test.on_axis(self.axis)), np.nan)
         if self.same:
-            distances[test.places(task, self.axis, self.same)] = self.distances_on(test, task)
+            distances[test.indices(task, self.axis, self.same)] = self.distances_on(test, task)
         return distances
 
     def distances_on(self, test: TestSet, task: Task) -> Sequence[float] | Floats:
@@ -137,8 +137,8 @@ class Perturbation(Frozen):
         """Return this change without the parts that the scene of ``task`` does not show, for descriptions."""
         return self
 
-    def played(self, task: Task) -> Task:
-        """Return the task whose goal and scene an episode of ``task`` has with this change."""
+    def carry(self, task: Task) -> Task:
+        """Return ``task`` carried to the scene of this change; by default ``task``, in its own scene."""
         return task
 
     @property
@@ -222,23 +222,23 @@ class Axis(Frozen):
         """
         return True
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> Perturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> Perturbation:
         """Sample one perturbation of a task that the axis applies to, with randomness from ``rng`` alone.
 
         Args:
-            place: index into ``entries``, for axes that take the entries of a list; other axes ignore it.
+            entry_index: index into ``entries``, for axes that take the entries of a list; other axes ignore it.
         """
         raise NotImplementedError
 
     def sample_after(
-        self, rng: np.random.Generator, task: Task, place: int, earlier: Sequence[Perturbation]
+        self, rng: np.random.Generator, task: Task, entry_index: int, earlier: Sequence[Perturbation]
     ) -> Perturbation:
         """Sample one perturbation, as ``sample``, of a demonstration that an expansion generated.
 
         Args:
             earlier: changes with which the expansion generated it; empty for other demonstrations.
         """
-        return self.sample(rng, task, place).after(earlier)
+        return self.sample(rng, task, entry_index).after(earlier)
 
     def entries(self, task: Task) -> Sequence[str]:
         """List the entries that the axis takes its perturbations of a task from; empty if it samples from ranges."""

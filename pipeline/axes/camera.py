@@ -398,7 +398,7 @@ class CameraAxis(Axis):
                 return True
         return False
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> CameraPerturbation:
         component = pick(rng, self.components)
         return self._sample_at(rng, component, self.sample_level(rng), task)
 

@@ -132,7 +132,7 @@ class DisturbanceAxis(Axis):
     first_step: Intervals[Steps] = ((5, 18), (58, 66))
     away_steps: Steps = 5
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> DisturbancePerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> DisturbancePerturbation:
         level = self.sample_level(rng)
         steps = _step(rng, self.steps)
         first_step = _step(rng, self.first_step)

@@ -48,7 +48,7 @@ class Pair(NamedTuple):
     left_out: str
 
     @property
-    def played(self) -> Task:
+    def carried_task(self) -> Task:
         """The task in the other scene."""
         return carry(self.task, self.scene)
 
@@ -79,12 +79,12 @@ def _fault(task: Task, scene: Task) -> str:
     for other in tasks(task.suite):
         if other.instruction == task.instruction and bddl.read(other.bddl_file).scene == place:
             return "LIBERO has this instruction in the scene"
-    played = carry(task, scene)
+    carried_task = carry(task, scene)
     try:
-        definition_of(played)
+        definition_of(carried_task)
     except CannotCarryError as error:
         return str(error)
-    lost = lost_demands(task, played)
+    lost = lost_demands(task, carried_task)
     return f"in the scene, the instruction {lost[0]}" if lost else ""
 
 
@@ -103,15 +103,14 @@ def _trained(task: Task) -> tuple[Task, ...]:
     """
     pairs_of_task = [pair for pair in usable(task.suite) if pair.task == task]
     not_held_out = [pair for pair in pairs_of_task if (task, pair.scene) not in held_out_pairs(task.suite)]
-    return tuple(pair.scene for pair in not_held_out if not has_lookalike_in_place(pair.played))
+    return tuple(pair.scene for pair in not_held_out if not has_lookalike_in_place(pair.carried_task))
 
 
 @cache
 def level_of_pair(task: Task, scene: Task) -> Level:
     """Return the strength of a pair: the distance in the scene between the first things that both tasks take."""
-    played = definition_of(carry(task, scene))
-    centres_m = played.centres_m
-    usual_m, carried_m = (centres_m.get(_first_thing(each), (0.0, 0.0)) for each in (definition_of(scene), played))
+    usual, carried = definition_of(scene), definition_of(carry(task, scene))
+    usual_m, carried_m = (carried.centres_m.get(_first_thing(each), (0.0, 0.0)) for each in (usual, carried))
     apart_m = float(np.linalg.norm(np.subtract(usual_m, carried_m)))
     return LEVELS[int(np.searchsorted(LEVEL_M, apart_m))]
 
@@ -139,8 +138,8 @@ class GoalPerturbation(PhysicsPerturbation):
 
     changes_objects: ClassVar[bool] = True
 
-    def played(self, task: Task) -> Task:
-        """Return ``task`` in the other scene."""
+    def carry(self, task: Task) -> Task:
+        """Return ``task`` carried to the other scene."""
         return carry(task, find_task(task.suite, self.scene))
 
     @property
@@ -149,7 +148,7 @@ class GoalPerturbation(PhysicsPerturbation):
         return int(seeding.rng("goal start", self.scene, self.start).integers(2**32))
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """Return the scene, which the replay has opened by ``played`` and ``reset_seed``, with the goal's facts."""
+        """Return the scene, which the replay has opened by ``carry`` and ``reset_seed``, with the goal's facts."""
         facts = [list(fact) for fact in definition_of(demo.task).goal]
         return replace(scene, resolved={**scene.resolved, "goal": {"facts": facts}})
 
@@ -181,10 +180,13 @@ class GoalAxis(Axis):
         """List the names of the scenes to which the task is carried, of the configured levels."""
         return [scene.name for scene in _trained(task) if level_of_pair(task, scene) in self.levels]
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> GoalPerturbation:
-        """Return the scene at ``place`` of ``entries``, which start again at their end, with one of its starts."""
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> GoalPerturbation:
+        """Return the scene at ``entry_index`` of ``entries``, with one of its starts.
+
+        The list of entries starts again at its end.
+        """
         scenes = self.entries(task)
-        scene = find_task(task.suite, scenes[place % len(scenes)])
+        scene = find_task(task.suite, scenes[entry_index % len(scenes)])
         start = int(rng.integers(self.starts))
         sha256 = "" if scene.suite in SUITES else checksum(scene.bddl_file)
         return GoalPerturbation(scene=scene.name, start=start, level=level_of_pair(task, scene), scene_sha256=sha256)

@@ -154,16 +154,16 @@ class LanguageAxis(Axis):
         """
         return tuple(rewrite.text for rewrite in list_rewrites(task, self.components, self.levels, self.bank))
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
-        """Return the rewrite at ``place`` of the task's list, which starts again at its end.
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> LanguagePerturbation:
+        """Return the rewrite at ``entry_index`` of the task's list, which starts again at its end.
 
-        The caller assigns the places, because independent random choices would repeat. ``rng`` is not used.
+        The caller assigns the indices, because independent random choices would repeat. ``rng`` is not used.
 
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
         rewrites = list_rewrites(task, self.components, self.levels, self.bank)
-        return rewrites[place % len(rewrites)]
+        return rewrites[entry_index % len(rewrites)]
 
     def list_clear_rewrites(self, task: Task, test: TestSet, *, other_objects: bool = False) -> tuple[str, ...]:
         """List the rewrites of a task that keep their clearance to test instructions.

@@ -328,13 +328,13 @@ def demands(task: Task) -> tuple[Demand, ...]:
     return tuple(demand for demand in _of_goal(goal, original) if demand.met(original))
 
 
-def lost_demands(task: Task, played: Task) -> list[str]:
+def lost_demands(task: Task, carried_task: Task) -> list[str]:
     """List the faults of the task's own instruction in another scene that it does not have in its own scene.
 
     Args:
-        played: the task carried to the other scene.
+        carried_task: the task carried to the other scene.
     """
-    goal = read_goal(played)
+    goal = read_goal(carried_task)
     reading = Reading(task.instruction, goal.scene, hints=False)
     faults = [demand.fault for demand in _of_goal(goal, reading) if not demand.met(reading)]
     own = read_goal(task)

@@ -143,7 +143,7 @@ class LayoutAxis(Axis):
         """Return the level, which is the number of added objects."""
         return int(tested.parameters["count"])
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LayoutPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> LayoutPerturbation:
         level = self.sample_level(rng)
         fitting = _fitting(self.sources, task)
         shelf: dict[str, ObjectModel] = {}

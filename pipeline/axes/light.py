@@ -175,14 +175,21 @@ class LightAxis(Axis):
         _range((0.05, 0.25), (1.85, 2.0), (0.53, 0.65), (17, 30), (26, 32), (0.0, 0.06)),
     )
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LightPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> LightPerturbation:
         component, level = self._sample_component(rng), self.sample_level(rng)
-        properties: dict[Component, tuple[Property, ...]] = {
-            "shadows": ("shadows", "direction"),
-            "combined": ("diffuse", "direction", "specular", *(("shadows",) if rng.random() < 0.5 else ())),
-        }
+        # Sampled for every component: stored plans depend on the number of samples.
+        casts_shadows = rng.random() < 0.5
+        names: tuple[Property, ...]
+        match component:
+            case "shadows":
+                names = ("shadows", "direction")
+            case "combined":
+                names = ("diffuse", "direction", "specular")
+                if casts_shadows:
+                    names += ("shadows",)
+            case _:
+                names = (component,)
         parameters: dict[str, object] = {}
-        names = properties.get(component, (component,))
         # The kitchen's lamps and lamps with shadows already have their largest brightness.
         brightest = "shadows" in names or bddl.read(task.bddl_file).arena == "kitchen"
         for name in names:

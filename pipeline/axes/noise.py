@@ -185,8 +185,8 @@ class NoiseAxis(Axis):
         """Return the level by the severity; two severities make one level."""
         return level_from(float(tested.parameters["severity"]) / 2)
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
-        """Sample a component and a level, each with equal probability, independent of ``task`` and ``place``."""
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> NoisePerturbation:
+        """Sample a component and a level, each with equal probability, independent of ``task`` and ``entry_index``."""
         grid = self._grids[pick(rng, self.components)]
         level = self.sample_level(rng)
         effect = grid[level - 1]

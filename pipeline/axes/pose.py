@@ -70,7 +70,7 @@ MOST_ATTEMPTS = 200
 Shifts = dict[str, tuple[float, float]]
 """Name of a thing to its displacement (dx, dy) in m."""
 
-_Places = dict[Task, list[tuple[str, Shifts]]]
+_ShiftsByTask = dict[Task, list[tuple[str, Shifts]]]
 """LIBERO task to the displacements of its test tasks, by their names, or of a run's episodes, without names."""
 
 
@@ -294,7 +294,7 @@ def displacements(parameters: Mapping[str, object]) -> Shifts:
 
 
 def sample_scene(
-    rng: np.random.Generator, level: Level, task: Task, places_m: Shifts, source_m: Shifts | None = None
+    rng: np.random.Generator, level: Level, task: Task, base_shifts_m: Shifts, source_shifts_m: Shifts | None = None
 ) -> ScenePerturbation:
     """Sample moves uniform over the disks of a level, again if they break the scene that the task's file defines.
 
@@ -302,45 +302,64 @@ def sample_scene(
     hold, and the hand must reach the objects that it has to grasp. No two things may come much closer than before.
 
     Args:
-        places_m: displacements of things from LIBERO's own places before those of the disks.
-        source_m: displacements of things in the perturbed demonstration from LIBERO's own places.
+        base_shifts_m: displacements of things from LIBERO's own places before those of the disks.
+        source_shifts_m: displacements of things in the perturbed demonstration from LIBERO's own places.
     """
-    source_m = source_m or {}
+    source_shifts_m = source_shifts_m or {}
     definition = definition_of(task)
     carriers, centres_m = definition.carriers, definition.centres_m
     radius_m = level * _disk_m(task)
     for _ in range(MOST_ATTEMPTS):
-        shifts = {}
-        for carrier in dict.fromkeys(carriers.values()):
-            reach_m = radius_m * math.sqrt(rng.uniform())
-            bearing_rad = rng.uniform(-math.pi, math.pi)
-            offset_m = [reach_m * math.cos(bearing_rad), reach_m * math.sin(bearing_rad)]
-            place_m: ArrayLike = (0.0, 0.0)
-            if carrier in places_m:
-                place_m = np.subtract(places_m[carrier], source_m.get(carrier, (0.0, 0.0)))
-            shifts[carrier] = np.round(np.add(place_m, offset_m), 4)
+        shifts_m = _sample_shifts(rng, carriers.values(), radius_m, base_shifts_m, source_shifts_m)
         xy_m = {}
         for thing, carrier in carriers.items():
-            xy_m[thing] = centres_m[thing] + np.add(source_m.get(thing, (0.0, 0.0)), shifts[carrier])
+            xy_m[thing] = centres_m[thing] + np.add(source_shifts_m.get(thing, (0.0, 0.0)), shifts_m[carrier])
         if _fits(task, xy_m):
             break
     moves = []
     for thing, carrier in carriers.items():
-        dx_m, dy_m = shifts[carrier]
+        dx_m, dy_m = shifts_m[carrier]
         moves.append(Move(name=thing, dx_m=float(dx_m), dy_m=float(dy_m)))
     return ScenePerturbation(level=level, moves=tuple(moves))
 
 
-def _benchmark_places_m(task: Task) -> Shifts:
+def _sample_shifts(
+    rng: np.random.Generator, carriers: Iterable[str], radius_m: float, base_shifts_m: Shifts, source_shifts_m: Shifts
+) -> dict[str, Floats]:
+    """Sample the displacement (2,) of each carrier from its place in the demonstration, for one attempt.
+
+    Args:
+        carriers: things that stand on the working surface; repeated names count once.
+        radius_m: radius of the disks.
+        base_shifts_m, source_shifts_m: as for ``sample_scene``.
+    """
+    shifts_m: dict[str, Floats] = {}
+    for carrier in dict.fromkeys(carriers):
+        offset_m = _sample_offset_m(rng, radius_m)
+        base_m: ArrayLike = (0.0, 0.0)
+        if carrier in base_shifts_m:
+            base_m = np.subtract(base_shifts_m[carrier], source_shifts_m.get(carrier, (0.0, 0.0)))
+        shifts_m[carrier] = np.round(np.add(base_m, offset_m), 4)
+    return shifts_m
+
+
+def _sample_offset_m(rng: np.random.Generator, radius_m: float) -> tuple[float, float]:
+    """Sample a point (x, y), uniform over the disk around the origin."""
+    reach_m = radius_m * math.sqrt(rng.uniform())
+    bearing_rad = rng.uniform(-math.pi, math.pi)
+    return reach_m * math.cos(bearing_rad), reach_m * math.sin(bearing_rad)
+
+
+def _benchmark_shifts_m(task: Task) -> Shifts:
     """Return the displacements of ``BASE_M`` for a task of the goal suite, if the hand can then reach the object."""
     if task.suite != "libero_goal":
         return {}
     centres_m = definition_of(task).centres_m
-    places_m = {}
-    for name, shift in BASE_M.items():
-        if _within_reach(task, name, np.add(centres_m[name], shift)):
-            places_m[name] = shift
-    return places_m
+    shifts_m = {}
+    for name, shift_m in BASE_M.items():
+        if _within_reach(task, name, np.add(centres_m[name], shift_m)):
+            shifts_m[name] = shift_m
+    return shifts_m
 
 
 def _disk_m(task: Task) -> float:
@@ -434,13 +453,13 @@ class PoseAxis(Axis):
 
     def levels_set_shares(self, task: Task) -> bool:
         """Return whether no scene has level 5 for LIBERO-Plus's places."""
-        return self.benchmark_places == 0 or 5 not in self.levels or not _benchmark_places_m(task)
+        return self.benchmark_places == 0 or 5 not in self.levels or not _benchmark_shifts_m(task)
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
-        return self.sample_after(rng, task, place, ())
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> PosePerturbation | ScenePerturbation:
+        return self.sample_after(rng, task, entry_index, ())
 
     def sample_after(
-        self, rng: np.random.Generator, task: Task, place: int, earlier: Sequence[Perturbation]
+        self, rng: np.random.Generator, task: Task, entry_index: int, earlier: Sequence[Perturbation]
     ) -> PosePerturbation | ScenePerturbation:
         movable = self._movable(task)
         component = pick(rng, [component for component in self.components if component in movable])
@@ -454,26 +473,26 @@ class PoseAxis(Axis):
         return move.after(earlier)
 
     def _sample_moved_scene(
-        self, rng: np.random.Generator, level: Level, task: Task, source_m: Shifts
+        self, rng: np.random.Generator, level: Level, task: Task, source_shifts_m: Shifts
     ) -> ScenePerturbation:
         """Sample a scene from the demonstration's own places, or in the goal suite from the benchmark's."""
-        places_m = _benchmark_places_m(task)
-        if not places_m or 5 not in self.levels or rng.random() >= self.benchmark_places:
-            return sample_scene(rng, level, task, {}, source_m)
+        base_shifts_m = _benchmark_shifts_m(task)
+        if not base_shifts_m or 5 not in self.levels or rng.random() >= self.benchmark_places:
+            return sample_scene(rng, level, task, {}, source_shifts_m)
         disk_level = pick(rng, LEVELS)
-        scene = sample_scene(rng, disk_level, task, places_m, source_m)
+        scene = sample_scene(rng, disk_level, task, base_shifts_m, source_shifts_m)
         return scene.model_copy(update={"level": 5, "disk_level": disk_level})
 
     @classmethod
     def observe_tests(cls, test: TestSet) -> Iterator[tuple[str, float]]:
         """Measure the displacements of each test task's targets, and the distance to the nearest other test task."""
-        places: _Places = defaultdict(list)
+        shifts_by_task: _ShiftsByTask = defaultdict(list)
         for tested in test.on_axis("pose"):
             task = find_task(tested.suite, tested.base)
             shifts = displacements(tested.parameters)
             yield from _targets_moved(task, shifts, cls.level_of_test(tested))
-            places[task].append((tested.name, shifts))
-        yield from _to_nearest(test, places)
+            shifts_by_task[task].append((tested.name, shifts))
+        yield from _to_nearest(test, shifts_by_task)
 
     @classmethod
     def observe_together(cls, kept: Sequence[KeptPerturbation[_PosePerturbation]], test: TestSet) -> Measures:
@@ -481,10 +500,10 @@ class PoseAxis(Axis):
 
         A test task is left out if no episode moves one of its objects of interest.
         """
-        places: _Places = defaultdict(list)
+        shifts_by_task: _ShiftsByTask = defaultdict(list)
         for item in kept:
-            places[item.task].append(("", item.perturbation.shifts_in_all))
-        return _to_nearest(test, places)
+            shifts_by_task[item.task].append(("", item.perturbation.shifts_in_all))
+        return _to_nearest(test, shifts_by_task)
 
     @classmethod
     def describe_coverage(
@@ -534,12 +553,12 @@ def _targets_moved(task: Task, shifts: Shifts, level: int) -> Iterator[tuple[str
             yield f"displacement of the target in {task.suite}, level {level} (cm)", moved_cm
 
 
-def _to_nearest(test: TestSet, places: _Places) -> Iterator[tuple[str, float]]:
+def _to_nearest(test: TestSet, shifts_by_task: _ShiftsByTask) -> Iterator[tuple[str, float]]:
     """Measure the distance of each test task's objects of interest to their nearest places under other names."""
     for tested in test.on_axis("pose"):
         task = find_task(tested.suite, tested.base)
         tested_shifts = displacements(tested.parameters)
-        others = [shifts for name, shifts in places[task] if name != tested.name]
+        others = [shifts for name, shifts in shifts_by_task[task] if name != tested.name]
         for thing in definition_of(task).things_of_interest:
             if thing not in tested_shifts:
                 continue

@@ -79,28 +79,44 @@ class RobotPerturbation(PhysicsPerturbation):
         before = compiled.touching().keys()
         joints = [model.joint(name) for name in ARM]
         arm = [joint.qposadr[0] for joint in joints]
-        pulled = self.component == "controller_posture" and scene.start.posture_rad is not None
-        posture = (scene.start.posture_rad if pulled else data.qpos[arm]) + np.array(self.joint_offsets_rad)
-        low, high = np.array([joint.range for joint in joints]).T
-        if (posture < low + LIMIT_MARGIN_RAD).any() or (posture > high - LIMIT_MARGIN_RAD).any():
-            raise RejectedError("joint_limit")
-        if np.linalg.norm(HOME_RAD + benchmark_offsets_rad() - posture, axis=1).min() < self.clearance:
-            raise RejectedError("test_posture")
-        data.qpos[arm] = posture
+        posture_rad = self._reference_posture_rad(scene, data.qpos[arm]) + np.array(self.joint_offsets_rad)
+        self._reject_posture(posture_rad, np.array([joint.range for joint in joints]))
+        data.qpos[arm] = posture_rad
         data.qvel[[joint.dofadr[0] for joint in joints]] = 0.0
         state = compiled.state
         compiled.restore(state)
         if self.component == "controller_posture":
-            from scipy.spatial.transform import Rotation  # takes long, and every process of a run imports the axes
-
-            hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
-            pulled_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
-            start = replace(scene.start, posture_rad=tuple(posture.tolist()))
-            return replace(scene, start=start, resolved={**scene.resolved, "robot": pulled_to})
+            hand_rotation = data.site("gripper0_grip_site").xmat.reshape(3, 3)
+            return _with_controller_posture(scene, posture_rad, hand_rotation)
         if compiled.touching().keys() - before:
             raise RejectedError("robot_in_collision")
-        resolved = {**scene.resolved, "robot": {"joints_rad": posture.tolist()}}
+        resolved = {**scene.resolved, "robot": {"joints_rad": posture_rad.tolist()}}
         return replace(scene, state=state, start=replace(scene.start, posture_rad=None), resolved=resolved)
+
+    def _reference_posture_rad(self, scene: Scene, recorded_rad: Floats) -> Floats:
+        """Return the posture (7,) of the clean twin that the offset is added to.
+
+        Args:
+            recorded_rad: (7,) posture in which the arm starts.
+        """
+        if self.component == "controller_posture" and scene.start.posture_rad is not None:
+            return np.array(scene.start.posture_rad)
+        return recorded_rad
+
+    def _reject_posture(self, posture_rad: Floats, ranges_rad: Floats) -> None:
+        """Reject a posture (7,) at the limits of the joints, and a posture of the test set.
+
+        Args:
+            ranges_rad: (7, 2) lower and upper limit of each joint.
+
+        Raises:
+            RejectedError: ``joint_limit`` or ``test_posture``, see ``apply``.
+        """
+        low, high = ranges_rad.T
+        if (posture_rad < low + LIMIT_MARGIN_RAD).any() or (posture_rad > high - LIMIT_MARGIN_RAD).any():
+            raise RejectedError("joint_limit")
+        if np.linalg.norm(HOME_RAD + benchmark_offsets_rad() - posture_rad, axis=1).min() < self.clearance:
+            raise RejectedError("test_posture")
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Return the distances (N,) to the offsets of all robot tasks; all tasks share one arm."""
@@ -130,6 +146,20 @@ class RobotPerturbation(PhysicsPerturbation):
     def _distances_rad(self, offsets_rad: ArrayLike) -> Floats:
         """Return the distances (N,) to offsets (N, 7)."""
         return np.asarray(np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1))
+
+
+def _with_controller_posture(scene: Scene, posture_rad: Floats, hand_rotation: Floats) -> Scene:
+    """Return the scene with the posture (7,) to which the controller pulls the arm.
+
+    Args:
+        hand_rotation: (3, 3) orientation of the grip site in this posture, to which the controller pulls the hand.
+    """
+    from scipy.spatial.transform import Rotation  # takes long, and every process of a run imports the axes
+
+    hand = Rotation.from_matrix(hand_rotation)
+    pulled_to = {"posture_rad": posture_rad.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
+    start = replace(scene.start, posture_rad=tuple(posture_rad.tolist()))
+    return replace(scene, start=start, resolved={**scene.resolved, "robot": pulled_to})
 
 
 @cache
@@ -179,7 +209,7 @@ class RobotAxis(Axis):
         """Return the level by the norm of the offset, 0.1 rad for each level."""
         return level_from(float(tested.parameters["id"]) / 100)
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> RobotPerturbation:
         level = self.sample_level(rng)
         component = pick(rng, self.components)
         direction = rng.standard_normal(7)

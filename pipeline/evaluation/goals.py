@@ -273,8 +273,8 @@ def resolve_goal(task: EvaluationTask) -> tuple[Task, Hashable]:
     base = find_task(task.suite, task.base)
     asked = find_carried_task(task)
     if asked is not None:
-        played = carry(asked, base)
-        return played, definition_of(played).asked
+        carried_task = carry(asked, base)
+        return carried_task, definition_of(carried_task).asked
     replacement = find_replacement(base, task.name)
     return replace(base, instruction=replacement.instruction), _read_asked(base, replacement)
 

@@ -74,8 +74,8 @@ class EpisodeFacts(NamedTuple):
     scene: str = ""
 
     @property
-    def played(self) -> str:
-        """Return ``<suite>/<task>`` of the demonstration, with the scene if that is another one."""
+    def task_file(self) -> str:
+        """Name of the file of its task, ``<suite>/<task>``, with the scene if the task is carried to another one."""
         task = self.demo.rpartition("/")[0]
         return f"{task}{IN_SCENE}{self.scene}" if self.scene else task
 

@@ -196,6 +196,14 @@ class Bddl:
         """Subset of ``things`` that the task is about."""
         return self.things_named(self.of_interest)
 
+    @property
+    def things_of_goal(self) -> tuple[str, ...]:
+        """Subset of ``things`` that the facts of the goal refer to."""
+        names: list[str] = []
+        for _, *arguments in self.goal:
+            names += arguments
+        return self.things_named(names)
+
     def things_named(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return the subset of ``things`` that some names refer to.
 

@@ -61,14 +61,14 @@ class DemoEntry:
     @classmethod
     def of(cls, demo: Demo) -> DemoEntry:
         return cls(
-            demo.task,
-            demo.key,
-            demo.source,
-            demo.origin,
-            demo.sha256,
-            len(demo.actions),
-            demo.perturbations,
-            demo.expanded_from_sha256,
+            task=demo.task,
+            key=demo.key,
+            source=demo.source,
+            origin=demo.origin,
+            sha256=demo.sha256,
+            steps=len(demo.actions),
+            perturbations=demo.perturbations,
+            expanded_from_sha256=demo.expanded_from_sha256,
         )
 
 
@@ -159,19 +159,25 @@ class StarterSource:
         except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError) as error:
             what = f"no starter demonstration of {task} ({error})"
             raise PipelineError(what, where=folder, remedy=REINSTALL) from error
-        return _Recorded(task, key, source, HUMAN, actions, init_state[None], None).checked(str(folder))
+        return _Recorded(task, key, source, HUMAN, actions, init_state[None], None).to_demo(str(folder))
 
 
 @dataclass(frozen=True)
-class _Remarks:
-    """Demonstrations of a file whose use may differ from their author's expectation.
+class _FileIndex:
+    """Contents of one file.
+
+    The last three attributes list demonstrations whose use may differ from their author's expectation.
 
     Attributes:
+        entries: the usable demonstrations, at most the number that was asked for.
+        problems: problems of the unusable demonstrations that were read.
         clipped: demonstration to the number of its actions that are limited to [-1, 1].
         copies: demonstration to the id of an earlier one with equal content.
         with_added_objects: demonstrations with added objects.
     """
 
+    entries: list[DemoEntry] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
     clipped: dict[str, int] = field(default_factory=dict)
     copies: dict[str, str] = field(default_factory=dict)
     with_added_objects: list[str] = field(default_factory=list)
@@ -204,13 +210,12 @@ class HDF5Source:
         # Episodes are identified by content: two copies would make two rows with one id.
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
-            remarks = _Remarks()
             try:
                 with self._data(task) as data:
-                    usable, unusable = self._index_file(task, data, per_task, first_with, remarks)
-                entries += usable
-                problems += unusable
-                notes += self._notes(task, remarks)
+                    indexed = self._index_file(task, data, per_task, first_with)
+                entries += indexed.entries
+                problems += indexed.problems
+                notes += self._notes(task, indexed)
             except PipelineError as error:
                 problems.append(Problem(str(task), error))
         return DemoIndex(entries, problems, tuple(notes))
@@ -221,39 +226,33 @@ class HDF5Source:
         data: h5py.Group,
         per_task: int | None,
         first_with: dict[str, DemoEntry],
-        remarks: _Remarks,
-    ) -> tuple[list[DemoEntry], list[Problem]]:
-        """Index the demonstrations of one file.
+    ) -> _FileIndex:
+        """Index the first ``per_task`` usable demonstrations of one file.
 
         Args:
             data: the group of the file's demonstrations.
-            first_with: content of a demonstration to its first entry; extended.
-            remarks: extended.
-
-        Returns:
-            The usable demonstrations, at most ``per_task``, and the problems of the unusable ones among them.
+            first_with: hash of a demonstration's content to the first entry with it; extended by this file's entries.
         """
-        entries: list[DemoEntry] = []
-        problems: list[Problem] = []
+        indexed = _FileIndex()
         for key in hdf5.names(data, str(self._path(task))):
-            if len(entries) == per_task:
+            if len(indexed.entries) == per_task:
                 break
             try:
                 entry = DemoEntry.of(self._read(task, key, data))
             except PipelineError as error:
-                problems.append(Problem(f"{task}/{key}", error))
+                indexed.problems.append(Problem(f"{task}/{key}", error))
                 continue
             first = first_with.setdefault(entry.sha256, entry)
             if first is not entry:
-                remarks.copies[key] = first.demo_id
+                indexed.copies[key] = first.demo_id
             elif _has_added_objects(entry):
-                remarks.with_added_objects.append(key)
+                indexed.with_added_objects.append(key)
             else:
-                entries.append(entry)
+                indexed.entries.append(entry)
                 outside = _outside(data, key, str(self._path(task)))
                 if outside:
-                    remarks.clipped[key] = outside
-        return entries, problems
+                    indexed.clipped[key] = outside
+        return indexed
 
     def load(self, demo_id: str) -> Demo:
         """Load one demonstration, by its id."""
@@ -331,29 +330,29 @@ class HDF5Source:
             reject_other_control(data, f"{path} data")
             yield data
 
-    def _notes(self, task: Task, remarks: _Remarks) -> Iterator[str]:
+    def _notes(self, task: Task, indexed: _FileIndex) -> Iterator[str]:
         """Yield notes on content of a task's file that is ignored or changed."""
         path = self._path(task)
         with hdf5.opened(path) as file:
             masks = hdf5.masks(file)
             if masks:
                 yield f"{path}: mask/ ({', '.join(masks)}) is ignored: all demonstrations of data/ are used"
-        clipped = remarks.clipped
+        clipped = indexed.clipped
         if clipped:
             yield (
                 f"{path}: {sum(clipped.values())} actions of {len(clipped)} demonstrations are limited to [-1, 1], as "
                 f"robosuite does when it executes them (first: {next(iter(clipped))})"
             )
-        if remarks.copies:
-            copy, original = next(iter(remarks.copies.items()))
+        if indexed.copies:
+            copy, original = next(iter(indexed.copies.items()))
             yield (
-                f"{path}: {len(remarks.copies)} demonstrations are left out, as copies in actions, states and model "
+                f"{path}: {len(indexed.copies)} demonstrations are left out, as copies in actions, states and model "
                 f"(first: data/{copy}, of {original})"
             )
-        if remarks.with_added_objects:
+        if indexed.with_added_objects:
             yield (
-                f"{path}: {len(remarks.with_added_objects)} demonstrations are left out, because they are episodes of "
-                f"the axis layout, whose objects no new label would state (first: {remarks.with_added_objects[0]})"
+                f"{path}: {len(indexed.with_added_objects)} demonstrations are left out, because they are episodes of "
+                f"the axis layout, whose objects no new label would state (first: {indexed.with_added_objects[0]})"
             )
 
     def _read(self, task: Task, key: str, data: h5py.Group) -> Demo:
@@ -381,7 +380,7 @@ class HDF5Source:
         source = f"{task.suite}/{path.name} {key}"
         origin = EXPANDED if hdf5.EXPANDED_FROM in group.attrs else HUMAN
         model_file = hdf5.text(group, "model_file", where)
-        demo = _Recorded(task, key, source, origin, actions, states, model_file).checked(where)
+        demo = _Recorded(task, key, source, origin, actions, states, model_file).to_demo(where)
         if origin == HUMAN:
             return demo
         changes = hdf5.text(group, "perturbations", where)
@@ -421,11 +420,35 @@ class _Recorded(NamedTuple):
     states: Floats
     model_file: str | None
 
-    def checked(self, where: str) -> Demo:
-        """Check the arrays and convert the recording to a demonstration; an error names it by ``where``.
+    def to_demo(self, where: str) -> Demo:
+        """Check the arrays and convert the recording to a demonstration.
+
+        Args:
+            where: name of the recording in errors.
 
         Raises:
             PipelineError: when the demonstration cannot be used.
+        """
+        self._reject_bad_arrays(where)
+        executed = _as_executed(self.actions)
+        _reject_other_gripper(executed, where)
+        return Demo(
+            task=self.task,
+            key=self.key,
+            source=self.source,
+            origin=self.origin,
+            sha256=self._content_sha256(),
+            actions=executed,
+            init_state=self.states[0].copy(),
+            states=self.states if len(self.states) == len(self.actions) else None,
+            model_xml=self._relocated_model(where),
+        )
+
+    def _reject_bad_arrays(self, where: str) -> None:
+        """Reject actions and states of other shapes, with values that are not finite, or with too large states.
+
+        Raises:
+            PipelineError: naming the first fault.
         """
         actions, states = self.actions, self.states
         fault = None
@@ -440,38 +463,44 @@ class _Recorded(NamedTuple):
         if fault:
             expected = f"actions (T, 7) and states (T, S), all finite and no state beyond {LARGEST_STATE:.0e}"
             raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.AS_RECORDED)
-        commands = SCHEMA.action.gripper
-        executed = _as_executed(actions)
-        unknown = commands.others(executed[:, 6])
-        if unknown:
-            raise PipelineError(
-                f"the gripper has the command {min(unknown):g}",
-                where=where,
-                expected=f"{commands.open:g} (open) or {commands.close:g} (close) as the last number of each action",
-                remedy="set each command to the nearer of the two in a copy of the file",
-            )
+
+    def _content_sha256(self) -> str:
+        """Return the hash of arrays and model, and of the task's file unless the task is LIBERO's."""
         # Hash the model as recorded: a relocated model would differ from machine to machine.
         content = hashlib.sha256()
-        for array in (actions, states):
+        for array in (self.actions, self.states):
             content.update(repr(array.shape).encode())
             content.update(array.astype("<f8").tobytes())
         content.update((self.model_file or "").encode())
         if self.task.suite not in SUITES:  # LIBERO's own tasks change only with its package.
             content.update(self.task.bddl_file.read_bytes())
-        model_xml = None
-        if self.model_file is not None:
-            model_xml = as_defined(relocate(self.model_file, where=f"{where} model_file"), self.task)
-        all_states = states if len(states) == len(actions) else None
-        return Demo(
-            task=self.task,
-            key=self.key,
-            source=self.source,
-            origin=self.origin,
-            sha256=content.hexdigest(),
-            actions=executed,
-            init_state=states[0].copy(),
-            states=all_states,
-            model_xml=model_xml,
+        return content.hexdigest()
+
+    def _relocated_model(self, where: str) -> str | None:
+        """Return the recorded model with this machine's paths and the names that the task defines.
+
+        Raises:
+            PipelineError: if the model cannot be used on this machine.
+        """
+        if self.model_file is None:
+            return None
+        return as_defined(relocate(self.model_file, where=f"{where} model_file"), self.task)
+
+
+def _reject_other_gripper(executed: Floats, where: str) -> None:
+    """Reject actions (T, 7) whose gripper commands are neither open nor close.
+
+    Raises:
+        PipelineError: naming the smallest of the other commands.
+    """
+    commands = SCHEMA.action.gripper
+    unknown = commands.others(executed[:, 6])
+    if unknown:
+        raise PipelineError(
+            f"the gripper has the command {min(unknown):g}",
+            where=where,
+            expected=f"{commands.open:g} (open) or {commands.close:g} (close) as the last number of each action",
+            remedy="set each command to the nearer of the two in a copy of the file",
         )
 
 

@@ -77,6 +77,7 @@ class Environment:
         self._openings = len(self._env.env.object_property_initializers)
         self._placed: dict[int, str] = {}
         self._scene: str | None = None
+        self._site_rgba: NDArray[np.float32]
         self._push: Push | None = None
         self._steps = 0
 
@@ -134,20 +135,41 @@ class Environment:
             UnusableSceneError: if MuJoCo or LIBERO rejects the scene, or if the state does not fit its model.
         """
         env = self._env.env
-        if scene.model_xml != self._scene:
-            self._scene = None
-            try:
-                self._open(scene.model_xml)
-            except (ValueError, KeyError, mujoco.FatalError) as error:
-                # MuJoCo raises these errors while it compiles; robosuite raises them if the model lacks a name.
-                what = f"the scene is rejected ({error!s:.300})"
-                raise UnusableSceneError("scene_refused", what, self.task) from error
-            self._check_names()
-            self._scene, self._site_rgba = scene.model_xml, env.sim.model.site_rgba.copy()
-        else:
+        self._open_or_reset(scene.model_xml)
+        self._set_state(scene)
+        finish_action(env)
+        self._control_step = ControlStep(env)
+        self._push, self._steps = scene.start.push, 0
+
+    def _open_or_reset(self, model_xml: str) -> None:
+        """Open a scene; if it is the last restored scene, reset it in place instead.
+
+        Raises:
+            UnusableSceneError: ``scene_refused`` if MuJoCo or LIBERO rejects the scene.
+        """
+        env = self._env.env
+        if model_xml == self._scene:
             # While it steps, LIBERO changes one part of the model: the site that shows a lit burner.
             env.sim.model.site_rgba[:] = self._site_rgba
             self._reset_in_place()
+            return
+        self._scene = None
+        try:
+            self._open(model_xml)
+        except (ValueError, KeyError, mujoco.FatalError) as error:
+            # MuJoCo raises these errors while it compiles; robosuite raises them if the model lacks a name.
+            what = f"the scene is rejected ({error!s:.300})"
+            raise UnusableSceneError("scene_refused", what, self.task) from error
+        self._check_names()
+        self._scene, self._site_rgba = model_xml, env.sim.model.site_rgba.copy()
+
+    def _set_state(self, scene: Scene) -> None:
+        """Put robot, objects and controller into the start of the open scene.
+
+        Raises:
+            UnusableSceneError: ``state_mismatch`` if the state does not fit the model.
+        """
+        env, posture_rad = self._env.env, scene.start.posture_rad
         robot = env.robots[0]
         arm_qpos, arm_qvel = robot.controller.qpos_index, robot.controller.qvel_index
         # One number for each finger; robosuite's gripper keeps its last command over the reset.
@@ -155,21 +177,18 @@ class Environment:
         env.sim.reset()
         self._check_state(scene.state)
         env.sim.set_state_from_flattened(scene.state)
-        if scene.start.posture_rad is not None:
-            env.sim.data.qpos[arm_qpos] = scene.start.posture_rad
+        if posture_rad is not None:
+            env.sim.data.qpos[arm_qpos] = posture_rad
             env.sim.data.qvel[arm_qvel] = 0.0
         env.sim.forward()
         # After a reset in an evaluation, the controller knows the arm's posture. Its null space pulls the arm to this
         # posture, not to robosuite's home posture. Do the same here.
         robot.controller.update_initial_joints(env.sim.data.qpos[arm_qpos])
-        if scene.start.posture_rad is not None:
+        if posture_rad is not None:
             # LIBERO-Plus sets an initial state after a reset with another posture. Until the end of the first substep,
             # its controller still uses the posture of the reset. Do the same here.
             env.sim.set_state_from_flattened(scene.state)
             env.sim.forward()
-        finish_action(env)
-        self._control_step = ControlStep(env)
-        self._push, self._steps = scene.start.push, 0
 
     def settle(self, steps: int) -> None:
         """Keep the arm still, with the gripper open, for some control steps, while arm and objects come to rest.

@@ -27,7 +27,7 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
     """
     scene = CompiledScene(trajectory.scene)
     model = scene.model
-    target_names = of_goal(definition_of(task))
+    target_names = list_allowed_things(definition_of(task))
     allowed_roots = {int(model.body(f"{name}_main").rootid[0]) for name in target_names}
     robot = int(model.body("robot0_base").rootid[0])
     positions, rotations, touched_steps = [], [], 0
@@ -74,20 +74,17 @@ def smoothness(trajectory: Trajectory, task: Task) -> dict[str, float]:
     return {"steps": len(trajectory.actions), "path_m": quality.path_m, "jerk_rms_m_s3": quality.jerk_rms_m_s3}
 
 
-def of_goal(known: Bddl) -> Set[str]:
-    """Return the objects and fixtures that a solution may touch and move.
+def list_allowed_things(problem: Bddl) -> Set[str]:
+    """List the objects and fixtures that a solution may touch and move.
 
     These are the things that the goal names. Objects that stand on or in a moved target object, or in an opened drawer,
     are also included.
     """
-    named_things: set[str] = set()
-    for fact in known.goal:
-        named_things.update(known.things_named(fact[1:]))
-    opened_parts = [fact[1] for fact in known.goal if len(fact) == 2]
-    carriers = {*known.targets, *opened_parts}
-    while carried := {name for name, place in known.places.items() if place in carriers} - carriers:
+    opened_parts = [fact[1] for fact in problem.goal if len(fact) == 2]
+    carriers = {*problem.targets, *opened_parts}
+    while carried := {name for name, place in problem.places.items() if place in carriers} - carriers:
         carriers |= carried
-    return named_things | (carriers & known.objects.keys())
+    return {*problem.things_of_goal} | (carriers & problem.objects.keys())
 
 
 def _displacements(model: mujoco.MjModel, qpos: Floats, named: Set[str]) -> Floats:

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,28 +57,27 @@ def replay(
     if rejected:
         mode = "tracked" if replay_config.mode == "tracked" and reference() is not None else "open_loop"
         # The first state alone is stored.
-        executed = _execute(environment, scene, 0, lambda: iter(()))
-        return Trajectory(trajectory_id, mode, scene, **executed._replace(verdict=rejected)._asdict())
+        start = _execute(environment, scene, trajectory_id, 0, perturbations, mode, lambda: iter(()))
+        return replace(start, verdict=rejected)
 
-    def replay_by(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
-        executed = _execute(environment, scene, replay_config.settle_steps, policy)
-        fault = _fault_of(perturbations, executed.actions) if executed.verdict.kept else None
-        if fault is not None:
-            executed = executed._replace(verdict=Verdict(False, fault))
-        return Trajectory(trajectory_id, mode, scene, **executed._asdict())
-
-    # Recorded actions do not work against a push, so mode ``auto`` tracks pushed scenes even if they reach the goal.
-    tracks = replay_config.mode == "tracked" or (replay_config.mode == "auto" and scene.start.push is not None)
-    followed = reference() if tracks else None
-    if followed is None:
-        recorded = demo.actions[kept_actions(demo.actions, replay_config.noops)]
-        open_loop = replay_by("open_loop", lambda: iter(recorded))
-        if replay_config.mode != "auto" or open_loop.verdict.kept:
-            return open_loop
+    run = partial(_execute, environment, scene, trajectory_id, replay_config.settle_steps, perturbations)
+    if replay_config.mode == "tracked" or (replay_config.mode == "auto" and needs_tracking(scene)):
         followed = reference()
-        if followed is None:
-            return open_loop
-    return replay_by("tracked", lambda: _tracking(environment, followed))
+        if followed is not None:
+            return run("tracked", partial(_start_tracking, environment, followed))
+    recorded = demo.actions[kept_actions(demo.actions, replay_config.noops)]
+    open_loop = run("open_loop", lambda: iter(recorded))
+    if replay_config.mode != "auto" or open_loop.verdict.kept:
+        return open_loop
+    followed = reference()
+    if followed is None:
+        return open_loop
+    return run("tracked", partial(_start_tracking, environment, followed))
+
+
+def needs_tracking(scene: Scene) -> bool:
+    """Return whether a scene must be tracked: recorded actions do not work against a push, even if they succeed."""
+    return scene.start.push is not None
 
 
 def _without_simulation(demo: Demo, trajectory_id: str, error: UnusableSceneError) -> Trajectory:
@@ -95,19 +93,26 @@ def _without_simulation(demo: Demo, trajectory_id: str, error: UnusableSceneErro
     )
 
 
-class _Executed(NamedTuple):
-    """Fields of a ``Trajectory`` that come from the simulation."""
-
-    states: Floats
-    actions: Floats
-    site_alpha: NDArray[np.float32]
-    verdict: Verdict
-
-
 def _execute(
-    environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
-) -> _Executed:
-    """Let a scene settle, and then execute the actions that ``policy`` yields."""
+    environment: Environment,
+    scene: Scene,
+    trajectory_id: str,
+    settle_steps: int,
+    perturbations: Sequence[PhysicsPerturbation],
+    mode: str,
+    start_actions: Callable[[], Iterator[Floats]],
+) -> Trajectory:
+    """Restore a scene, let it settle, execute actions and judge the result.
+
+    Args:
+        environment: the environment of the scene's task.
+        scene: the scene to start in.
+        trajectory_id: the result's id.
+        settle_steps: number of control steps before the first action.
+        perturbations: changes that the executed actions must show.
+        mode: the result's mode.
+        start_actions: returns the actions (7,); called once the scene has settled.
+    """
     environment.restore(scene)
     # If the scene does not settle, store only the initial state.
     states, alphas = [environment.state], [environment.site_alpha]
@@ -116,7 +121,7 @@ def _execute(
     try:
         environment.settle(settle_steps)
         states, alphas = [environment.state], [environment.site_alpha]
-        for action in policy():
+        for action in start_actions():
             environment.step(action)
             actions.append(action)
             states.append(environment.state)
@@ -124,18 +129,22 @@ def _execute(
             succeeded.append(environment.succeeded())
     except RejectedError as error:
         rejected = Verdict(False, error.reason)
-    judged = rejected or judge(np.stack(states), np.array(succeeded, bool))
-    return _Executed(np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged)
+    stacked_states, executed = np.stack(states), np.array(actions).reshape(-1, 7)
+    verdict = rejected or judge(stacked_states, np.array(succeeded, bool))
+    fault = _find_fault(perturbations, executed) if verdict.kept else None
+    if fault is not None:
+        verdict = Verdict(False, fault)
+    return Trajectory(trajectory_id, mode, scene, stacked_states, executed, np.stack(alphas), verdict)
 
 
-def _fault_of(perturbations: Sequence[PhysicsPerturbation], actions: Floats) -> str | None:
+def _find_fault(perturbations: Sequence[PhysicsPerturbation], actions: Floats) -> str | None:
     """Return the first reason for which a perturbation drops the executed actions (K, 7), else ``None``."""
     faults = (perturbation.fault_of(actions) for perturbation in perturbations)
     return next((fault for fault in faults if fault), None)
 
 
-def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
-    """Yield the actions that follow a reference from the environment's restored state."""
+def _start_tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
+    """Return the actions that follow a reference from the environment's present state, computed one by one."""
     poses = {name: environment.pose(name) for name in (*reference.poses, *reference.places)}
     return follow(Route.through(reference, environment.hand, poses), lambda: environment.hand, environment.pose)
 

@@ -109,22 +109,23 @@ class Route:
         for name in sorted(poses, key=rank):
             pose = poses[name]
             reference_pose = reference.poses[name][0] if name in reference.poses else reference.places[name]
-            shift = pose[:3] - reference_pose[:3]
+            shift_m = pose[:3] - reference_pose[:3]
             turn = (_rotation(pose) * _rotation(reference_pose).inv()).as_rotvec()
-            if np.abs(shift).max() < 1e-4 and np.abs(turn).max() < 1e-3:
+            if np.abs(shift_m).max() < 1e-4 and np.abs(turn).max() < 1e-3:
                 continue
-            share = _followed(reference, name) * free_share
+            share = _share_to_follow(reference, name) * free_share
             if np.abs(turn[:2]).max() > TILTED_RAD and share.any():
                 raise RejectedError("object_not_upright")
-            upright = np.array([0.0, 0.0, turn[2]])
-            free_share, weights = free_share - share, share[:, None]
-            turned = Rotation.from_rotvec(upright).apply(positions - reference_pose[:3])
-            displaced = reference_pose[:3] + shift + turned
-            positions = positions + weights * (displaced - positions)
-            rotations = Rotation.from_rotvec(weights * upright) * rotations
-        shift, turn = hand[0] - positions[0], (hand[1] * rotations[0].inv()).as_rotvec()
-        weights = _returning(reference, np.concatenate([shift, turn]))[:, None]
-        return cls(reference, positions + weights * shift, Rotation.from_rotvec(weights * turn) * rotations)
+            free_share = free_share - share
+            yaw = np.array([0.0, 0.0, turn[2]])
+            positions, rotations = _bend_to_thing(positions, rotations, reference_pose[:3], shift_m, yaw, share)
+        start_shift_m, start_turn = hand[0] - positions[0], (hand[1] * rotations[0].inv()).as_rotvec()
+        start_share = _returning(reference, np.concatenate([start_shift_m, start_turn]))[:, None]
+        return cls(
+            reference,
+            positions + start_share * start_shift_m,
+            Rotation.from_rotvec(start_share * start_turn) * rotations,
+        )
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -136,6 +137,25 @@ class Route:
         turn = (self.rotations[step + 1] * self.rotations[step].inv()).as_rotvec()
         position: Floats = (1 - fraction) * self.positions_m[step] + fraction * self.positions_m[step + 1]
         return position, Rotation.from_rotvec(fraction * turn) * self.rotations[step]
+
+
+def _bend_to_thing(
+    positions_m: Floats, rotations: Rotation, place_m: Floats, shift_m: Floats, yaw: Floats, share: Floats
+) -> tuple[Floats, Rotation]:
+    """Return a route that follows a moved thing.
+
+    Args:
+        positions_m, rotations: (K+1, 3) and K+1, the route.
+        place_m: (3,) place of the thing in the reference.
+        shift_m: (3,) displacement of the thing.
+        yaw: (3,) turn of the thing about the vertical, a rotation vector in rad.
+        share: (K+1,) share of the displacement that each pose of the route follows.
+    """
+    weights = share[:, None]
+    turned = Rotation.from_rotvec(yaw).apply(positions_m - place_m)
+    displaced = place_m + shift_m + turned
+    positions_m = positions_m + weights * (displaced - positions_m)
+    return positions_m, Rotation.from_rotvec(weights * yaw) * rotations
 
 
 def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]) -> Iterator[Floats]:
@@ -176,16 +196,18 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
         index = upcoming
 
 
-def _grasp_offset(reference: Reference, step: int, hand: Hand, pose: Callable[[str], Floats], before: Floats) -> Floats:
+def _grasp_offset(
+    reference: Reference, step: int, hand: Hand, pose: Callable[[str], Floats], last_offset: Floats
+) -> Floats:
     """Return the offset (3,) in m from a carried object's place in the hand to its place in the reference's hand.
 
     The offset is in the hand's frame. It is zero if nothing is carried. While the object is put down, contacts shift it
-    in the hand, so the offset stays ``before``.
+    in the hand, so the offset stays ``last_offset``.
     """
     held = [name for name, mask in reference.held.items() if mask[step]]
     carried = [name for name in held if reference.carried[name][step]]
     if not carried:
-        return before if held else np.zeros(3)
+        return last_offset if held else np.zeros(3)
     name, (position, rotation) = carried[0], hand
     reference_reach = reference.poses[name][step, :3] - reference.positions_m[step]
     place_in_reference = reference.rotations[step].inv().apply(reference_reach)
@@ -193,7 +215,7 @@ def _grasp_offset(reference: Reference, step: int, hand: Hand, pose: Callable[[s
     return offset if np.linalg.norm(offset) < LOST_M else np.zeros(3)
 
 
-def _followed(reference: Reference, name: str) -> Floats:
+def _share_to_follow(reference: Reference, name: str) -> Floats:
     """Return the share (K+1,) of a moved thing's displacement that the hand has to follow at each state."""
     if _moves(reference, name):
         held_steps = np.flatnonzero(reference.held[name])
@@ -202,13 +224,15 @@ def _followed(reference: Reference, name: str) -> Floats:
         first = int(held_steps[0])
         # The object is carried off, or pushed all the way. The share falls to 0 until the object is put down.
         taken, put_down = long_runs[0] if long_runs else (first, int(held_steps[-1]))
-        return _window(reference, first, max(taken, first), put_down - MARGIN)
+        full_until = max(taken, first)
+        return _window(reference, full_from=first, full_until=full_until, zero_from=put_down - MARGIN, rise_from=None)
     weights: Floats = np.zeros(len(reference) + 1)
     for first, last in runs(reference.met[name], FLICKER):
-        since = _pushed_since(reference, first) if name in reference.places else first
+        rise_from = _pushed_since(reference, first) if name in reference.places else first
         later = np.flatnonzero(reference.engaged[last + FLICKER + 1 :])
-        until = last + FLICKER + 1 + int(later[0]) - MARGIN if len(later) else None
-        weights = np.maximum(weights, _window(reference, first, last, until, since))
+        zero_from = last + FLICKER + 1 + int(later[0]) - MARGIN if len(later) else None
+        window = _window(reference, full_from=first, full_until=last, zero_from=zero_from, rise_from=rise_from)
+        weights = np.maximum(weights, window)
     return weights
 
 
@@ -234,24 +258,26 @@ def _moves(reference: Reference, name: str) -> bool:
     return bool(travelled.max() > MOVED_M)
 
 
-def _window(reference: Reference, first: int, last: int, until: int | None, since: int | None = None) -> Floats:
-    """Return weights (K+1,) that are 1 from shortly before ``first`` to ``last``, and 0 from ``until`` on.
+def _window(
+    reference: Reference, *, full_from: int, full_until: int, zero_from: int | None, rise_from: int | None
+) -> Floats:
+    """Return weights (K+1,): 1 from shortly before ``full_from`` to ``full_until``, and 0 from ``zero_from`` on.
 
-    The weights rise after the last contact before ``first``, and after the hand has released all objects other than
-    the object that it holds at ``first``. If ``since`` is earlier, they rise from ``since`` on.
+    The weights rise after the last contact before ``full_from``, and after the hand has released all objects other
+    than the object that it holds at ``full_from``. If ``rise_from`` is earlier, they rise from ``rise_from`` on.
     """
     steps = np.arange(len(reference) + 1)
     engaged = reference.engaged.copy()
     for held in reference.held.values():
-        if not held[max(first - FLICKER, 0) : first + 1].any():
+        if not held[max(full_from - FLICKER, 0) : full_from + 1].any():
             engaged |= held
-    before = np.flatnonzero(engaged[: max(first - FLICKER, 0)])
-    start = int(before[-1]) + 1 if len(before) else 0
-    if since is not None:
-        start = min(start, since)
-    weights = _smooth((steps - start) / max(first - MARGIN - start, 1))
-    if until is not None:
-        weights = np.minimum(weights, 1 - _smooth((steps - last) / max(until - last, 1)))
+    contacts_before = np.flatnonzero(engaged[: max(full_from - FLICKER, 0)])
+    start = int(contacts_before[-1]) + 1 if len(contacts_before) else 0
+    if rise_from is not None:
+        start = min(start, rise_from)
+    weights = _smooth((steps - start) / max(full_from - MARGIN - start, 1))
+    if zero_from is not None:
+        weights = np.minimum(weights, 1 - _smooth((steps - full_until) / max(zero_from - full_until, 1)))
     return weights
 
 

@@ -30,20 +30,20 @@ class TakenEntries:
         self._times: Counter[str] = Counter()
 
     def order(self, entries: Sequence[str], key: str) -> list[int]:
-        """Return the places of the entries in the order in which a candidate tries them; [0] for an empty list."""
+        """Return the indices of the entries in the order in which a candidate tries them; [0] for an empty list."""
         if not entries:
             return [0]
 
-        def rank(place: int) -> tuple[int, str]:
-            entry = entries[place]
+        def rank(entry_index: int) -> tuple[int, str]:
+            entry = entries[entry_index]
             return self._times[entry], digest(key, entry)
 
         return sorted(range(len(entries)), key=rank)
 
-    def take(self, entries: Sequence[str], place: int) -> None:
-        """Count the entry at ``place`` as taken by a candidate."""
+    def take(self, entries: Sequence[str], entry_index: int) -> None:
+        """Count the entry at ``entry_index`` as taken by a candidate."""
         if entries:
-            self._times[entries[place]] += 1
+            self._times[entries[entry_index]] += 1
 
 
 class _Choice(NamedTuple):
@@ -52,13 +52,13 @@ class _Choice(NamedTuple):
     Attributes:
         task: the task that the axis perturbs, which an earlier axis may have carried to another scene.
         earlier: perturbations that the episode's start has from an expansion; none if the episode starts from a reset.
-        place: index into the axis's ``entries``.
+        entry_index: index into the axis's ``entries``.
     """
 
     axis: Axis
     task: Task
     earlier: Sequence[Perturbation]
-    place: int
+    entry_index: int
     perturbation: Perturbation
 
 
@@ -103,7 +103,7 @@ class Sampler:
             choices, perturbations = new
             contents.add(_content_of(perturbations))
             for choice in choices:
-                taken.take(choice.axis.entries(choice.task), choice.place)
+                taken.take(choice.axis.entries(choice.task), choice.entry_index)
             yield perturbations
 
     def _sample_new(
@@ -137,11 +137,11 @@ class Sampler:
         random = rng(self.seed, self.name, *key, attempt)
         choices: list[_Choice] = []
         for axis in self.axes:
-            turn = taken.order(axis.entries(task), digest(self.seed, self.name, *key))
-            place = turn[attempt % len(turn)]
-            perturbation = axis.sample_after(random, task, place, earlier)
-            choices.append(_Choice(axis, task, earlier, place, perturbation))
-            task = perturbation.played(task)
+            indices = taken.order(axis.entries(task), digest(self.seed, self.name, *key))
+            entry_index = indices[attempt % len(indices)]
+            perturbation = axis.sample_after(random, task, entry_index, earlier)
+            choices.append(_Choice(axis, task, earlier, entry_index, perturbation))
+            task = perturbation.carry(task)
             if perturbation.reset_seed is not None:
                 earlier = ()
         return choices

@@ -56,10 +56,7 @@ class Instances:
                 expected=f"{rows} or fewer",
                 remedy="leave out segmentation, boxes and object_poses, or plan fewer added objects for this task",
             )
-        goal_names: set[str] = set()
-        for fact in problem.goal:
-            goal_names.update(problem.things_named(fact[1:]))
-        self.boxed = (GRIPPER, *(self.names.index(name) for name in things if name in goal_names))
+        self.boxed = (GRIPPER, *(self.names.index(name) for name in problem.things_of_goal))
         bodies = [model.body(number).name for number in range(model.nbody)]
         self._bodies = {ROBOT: model.body("robot0_base").id, GRIPPER: model.body("gripper0_right_gripper").id}
         for body, name in enumerate(bodies):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer, played_task
+from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, carried_task, of_layer
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
@@ -88,7 +88,7 @@ class StagedTask:
         """Return the demonstration and its scene, or those of a reset of the scene that it is carried to."""
         task = self.demo.task
         for perturbation in perturbations:
-            task = perturbation.played(task)
+            task = perturbation.carry(task)
             seed = perturbation.reset_seed
             if seed is not None:
                 demo = at_reset(environment_of(task), replace(self.demo, task=task), seed)
@@ -246,7 +246,7 @@ def axis_sheet(stage: StagedTask, name: str, config: Config, test: TestSet) -> I
     if strips:
         tiles, sampled, views = strips, [], ["image"]
     for perturbations in sampled:
-        caption = describe_all(perturbations, played_task(demo.task, perturbations))
+        caption = describe_all(perturbations, carried_task(demo.task, perturbations))
         try:
             # A perturbation of the instruction alone changes no frame.
             visible = any(p.views for p in perturbations)

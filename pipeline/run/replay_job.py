@@ -16,7 +16,7 @@ from pipeline.libero.starts import kept_actions
 from pipeline.physics.environment import environment_of
 from pipeline.physics.quality import measure
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import at_reset, replay
+from pipeline.physics.replay import at_reset, needs_tracking, replay
 from pipeline.planning.plan import Row
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Demo, Scene, Task, Trajectory, Verdict
@@ -62,9 +62,8 @@ class ReplayJob:
             start = at_reset(environment, start, seed)
             replay_config = replay_config.model_copy(update={"mode": "tracked"})
         trajectory = replay(environment, start, self.row.trajectory_id, replay_config, physics, reference)
-        # Open-loop actions do not work against a push either.
-        tracks = seed is not None or trajectory.scene.start.push is not None
-        if tracks and trajectory.verdict.kept and trajectory.mode != "tracked":
+        must_track = seed is not None or needs_tracking(trajectory.scene)
+        if must_track and trajectory.verdict.kept and trajectory.mode != "tracked":
             trajectory = replace(trajectory, verdict=Verdict(False, "no_reference"))
         if trajectory.verdict.kept:
             trajectory = replace(trajectory, quality=measure(trajectory, task))

@@ -19,8 +19,8 @@ def list_episode_rewrites(axis: LanguageAxis | None, suite: str, task: str, pert
     """
     changes = from_json(perturbations)
     other_objects = any(change.changes_objects for change in changes)
-    played = task_of(suite, task, perturbations)
-    texts = _list_clear_rewrites(axis or LanguageAxis(), played, other_objects=other_objects)
+    carried_task = task_of(suite, task, perturbations)
+    texts = _list_clear_rewrites(axis or LanguageAxis(), carried_task, other_objects=other_objects)
     return tuple(text for text in texts if not any(change.named_in(text) for change in changes))
 
 

@@ -70,11 +70,11 @@ class TestSet:
     def on(self, task: Task, axis: str, same: Same = "task") -> tuple[TestTask, ...]:
         """Return the test tasks of one axis that perturb ``task``, or a task with the same property ``same``."""
         tests = self.on_axis(axis)
-        return tuple(tests[place] for place in self.places(task, axis, same))
+        return tuple(tests[index] for index in self.indices(task, axis, same))
 
-    def places(self, task: Task, axis: str, same: Same) -> list[int]:
+    def indices(self, task: Task, axis: str, same: Same) -> list[int]:
         """Return the indices of the test tasks of ``on`` in the test tasks of ``on_axis``."""
-        return _places(self, axis, same).get(common_key(task, same), [])
+        return _indices(self, axis, same).get(common_key(task, same), [])
 
     def find(self, suite: str, name: str) -> TestTask:
         """Return the test task of the given name.
@@ -105,10 +105,10 @@ class TestSet:
 
 
 @cache
-def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
+def _indices(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
     """Group the indices of an axis's test tasks by the ``common_key`` of the task that they perturb."""
     bases = [find_task(test_task.suite, test_task.base) for test_task in test.on_axis(axis)]
-    return grouped((common_key(task, same), place) for place, task in enumerate(bases))
+    return grouped((common_key(task, same), index) for index, task in enumerate(bases))
 
 
 @cache

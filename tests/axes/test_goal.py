@@ -117,12 +117,12 @@ def test_every_pair_of_the_130_tasks_is_used_or_left_out_with_a_reason() -> None
 def test_a_carried_task_has_the_scene_of_one_file_and_the_goal_of_the_other() -> None:
     for suite in SUITES:
         for pair in usable(suite):
-            made, scene, task = map(definition_of, (pair.played, pair.scene, pair.task))
+            made, scene, task = map(definition_of, (pair.carried_task, pair.scene, pair.task))
             assert replace(made, language=scene.language, goal=scene.goal, of_interest=scene.of_interest) == scene
-            assert (made.language, pair.played.instruction) == (task.language, pair.task.instruction)
+            assert (made.language, pair.carried_task.instruction) == (task.language, pair.task.instruction)
             kinds = [[made.category(made.owner(name) or name) for name in fact[1:]] for fact in made.goal]
             assert kinds == [[task.category(task.owner(name) or name) for name in fact[1:]] for fact in task.goal]
-            assert bddl.parse(bddl_text(pair.played), "") == made
+            assert bddl.parse(bddl_text(pair.carried_task), "") == made
 
 
 def test_a_scene_file_of_another_spelling_is_carried_to_as_libero_reads_it(tmp_path: Path) -> None:
@@ -135,8 +135,8 @@ def test_a_scene_file_of_another_spelling_is_carried_to_as_libero_reads_it(tmp_p
     )
     scene_file, plain, carried_to = (tmp_path / f"{name}.bddl" for name in ("scene", "plain", "carried"))
     scene_file.write_text(odd)
-    plain.write_text(bddl_text(pair.played))
-    carried_to.write_text(bddl_text(replace(pair.played, bddl_file=scene_file)))
+    plain.write_text(bddl_text(pair.carried_task))
+    carried_to.write_text(bddl_text(replace(pair.carried_task, bddl_file=scene_file)))
     read = robosuite_parse_problem(str(carried_to))
     assert read == robosuite_parse_problem(str(plain))
     assert " ".join(read["language_instruction"]) == definition_of(pair.task).language
@@ -253,7 +253,7 @@ def test_a_rewrite_that_means_two_things_of_the_scene_is_left_out() -> None:
     """A can is soup or tomato sauce where both stand."""
     left_out = 0
     for pair in usable("libero_object"):
-        own, there = (set(LanguageAxis().entries(task)) for task in (pair.task, pair.played))
+        own, there = (set(LanguageAxis().entries(task)) for task in (pair.task, pair.carried_task))
         assert there <= own
         assert len(there) > 10
         left_out += len(own - there)
@@ -269,8 +269,8 @@ def test_every_rewrite_joined_with_the_axis_goal_names_its_things() -> None:
         for pair in usable(suite):
             bank = load_bank()[pair.task.suite][pair.task.name]
             named = {text for component in ("distraction", "paraphrase") for text in bank[component]}
-            wordings = LanguageAxis().list_clear_rewrites(pair.played, test, other_objects=True)
-            assert {*wordings, *LanguageAxis().restrict_for([GoalAxis()]).entries(pair.played)} <= named
+            wordings = LanguageAxis().list_clear_rewrites(pair.carried_task, test, other_objects=True)
+            assert {*wordings, *LanguageAxis().restrict_for([GoalAxis()]).entries(pair.carried_task)} <= named
             assert len(wordings) > 10
 
 
@@ -309,10 +309,11 @@ def test_disks_of_a_carried_task_are_those_of_its_scene() -> None:
     first, second = (next(task for task in tasks("libero_10") if f"ROOM_SCENE{k}_" in task.name) for k in (1, 2))
     for task, scene in ((first, second), (second, first)):
         farthest_m = {}
-        for played in (scene, carry(task, scene)):
-            sampled = [PoseAxis(components=("scene",), levels=(1,)).sample(rng("t", k), played, k) for k in range(200)]
+        for task_there in (scene, carry(task, scene)):
+            axis = PoseAxis(components=("scene",), levels=(1,))
+            sampled = [axis.sample(rng("t", k), task_there, k) for k in range(200)]
             moves = [move for one in sampled if isinstance(one, ScenePerturbation) for move in one.moves]
-            farthest_m[played.name] = max(float(np.hypot(move.dx_m, move.dy_m)) for move in moves)
+            farthest_m[task_there.name] = max(float(np.hypot(move.dx_m, move.dy_m)) for move in moves)
         assert farthest_m[task.name] == pytest.approx(farthest_m[scene.name], rel=0.2)
         assert farthest_m[scene.name] == pytest.approx(0.02 if scene is first else 0.01, rel=0.2)
 

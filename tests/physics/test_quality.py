@@ -11,7 +11,7 @@ from pipeline.config import ReplayConfig
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
-from pipeline.physics.quality import measure, of_goal
+from pipeline.physics.quality import list_allowed_things, measure
 from pipeline.physics.replay import replay
 from pipeline.scenes.compiled import FINGERS
 from pipeline.types import State, Trajectory
@@ -32,7 +32,9 @@ def test_path_and_contacts_are_robosuites(replayed: tuple[Environment, Trajector
     environment, trajectory = replayed
     environment.restore(trajectory.scene)
     env = environment._env.env  # robosuite's own environment
-    allowed = {geom for name in of_goal(bddl.read(environment.task.bddl_file)) for geom in geoms_of(env, name)}
+    allowed: set[str] = set()
+    for name in list_allowed_things(bddl.read(environment.task.bddl_file)):
+        allowed.update(geoms_of(env, name))
     hand, touched = [], 0
     for step, state in enumerate(trajectory.states):
         env.sim.set_state_from_flattened(state)
@@ -74,7 +76,7 @@ def test_an_object_that_is_pushed_counts_and_one_of_the_goal_does_not(
     replayed: tuple[Environment, Trajectory],
 ) -> None:
     environment, trajectory = replayed
-    named = of_goal(bddl.read(environment.task.bddl_file))
+    named = list_allowed_things(bddl.read(environment.task.bddl_file))
     before = measure(trajectory, environment.task)
     for name in bddl.read(environment.task.bddl_file).objects:
         for step, left_m in ((len(trajectory.actions) // 2, 0.0), (-1, 0.05)):
@@ -137,7 +139,7 @@ def test_waiting_is_idle_and_shaking_is_jerk(replayed: tuple[Environment, Trajec
     ],
 )
 def test_what_a_solution_may_move(suite: str, name: str, expected: set[str]) -> None:
-    assert of_goal(bddl.read(find_task(suite, name).bddl_file)) == expected
+    assert list_allowed_things(bddl.read(find_task(suite, name).bddl_file)) == expected
 
 
 def test_an_object_in_a_drawer_moves_with_it() -> None:
@@ -145,4 +147,4 @@ def test_an_object_in_a_drawer_moves_with_it() -> None:
     task = find_task("libero_90", "KITCHEN_SCENE5_close_the_top_drawer_of_the_cabinet")
     known = bddl.read(task.bddl_file)
     inside = {name for name, place in known.places.items() if place == known.goal[0][1]}
-    assert of_goal(known) == {"white_cabinet_1", *inside}
+    assert list_allowed_things(known) == {"white_cabinet_1", *inside}

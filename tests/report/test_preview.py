@@ -96,7 +96,7 @@ class StubAxis(Axis):
 
     kind: type[Dimming] | type[Lift]
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> Any:
+    def sample(self, rng: np.random.Generator, task: Task, entry_index: int) -> Any:
         component = ("lamp", "window")[rng.integers(2)]
         return self.kind.model_validate({"component": component, "level": self.sample_level(rng)})
 

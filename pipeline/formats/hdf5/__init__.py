@@ -69,7 +69,7 @@ class Hdf5(Format[Hdf5Config]):
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
         for split_name, members in episodes.by_split(self.options.validation).items():
-            by_task = grouped((episodes.facts[episode_id].played, episode_id) for episode_id in members)
+            by_task = grouped((episodes.facts[episode_id].task_file, episode_id) for episode_id in members)
             for task, ids in sorted(by_task.items()):
                 pieces.append(Piece(f"dataset/{layout.file_of(task, split_name)}", ids, split_name))
         return pieces
@@ -105,7 +105,7 @@ class Hdf5(Format[Hdf5Config]):
             origin = row["demo_origin_sha256"]
             facts.append(EpisodeFacts(row["suite"], demo=row["demo_id"], origin=origin, scene=scene))
         held_out = demos_for_validation(facts, self.options.validation)
-        first = min(layout.file_of(one.played, "train") for one in facts if one.demo not in held_out)
+        first = min(layout.file_of(one.task_file, "train") for one in facts if one.demo not in held_out)
         return f"""\
 The files `hdf5/<suite>/<task>_demo.hdf5` have the layout of LIBERO's own demonstrations:
 

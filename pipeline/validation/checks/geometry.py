@@ -81,8 +81,5 @@ def check_boxes(case: Case) -> Iterator[Fault]:
 
 def _list_goal_places(case: Case) -> list[int]:
     """List the places in ``instances`` of the things that the task's goal names."""
-    problem = definition_of(case.task)
-    named_things: set[str] = set()
-    for fact in problem.goal:
-        named_things.update(problem.things_named(fact[1:]))
-    return [place for place, name in enumerate(case.made.instances) if name in named_things]
+    things = definition_of(case.task).things_of_goal
+    return [place for place, name in enumerate(case.made.instances) if name in things]
