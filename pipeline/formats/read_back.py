@@ -60,10 +60,11 @@ class Copy:
             instruction of the first step, and frames only if they are image files.
         instructions: one for each step.
         decoded: (view, step) to the frame, for ``sampled`` steps, where frames are a video.
-        marks: further columns of each step, by the dataset's own names, each (T,).
+        step_marks: further columns of each step, by the dataset's own names, each (T,).
         place: place of the episode, by the format's columns of the manifest.
         repeated: further name of a column of the provenance, to that column and the value under the further name.
-        said: lerobot's column of persistent language, the entries of each step; ``None`` where the dataset has none.
+        persistent_language: lerobot's column of persistent language, the entries of each step; ``None`` where the
+            dataset has none.
         events: lerobot's column of language events, likewise.
         train: True if the episode is in the training split.
         statistics: statistics of the episode; ``None`` where the dataset states none.
@@ -76,9 +77,9 @@ class Copy:
     episode: Episode
     instructions: Sequence[str]
     decoded: Mapping[tuple[str, int], Frame]
-    marks: Mapping[str, NDArray[Any]]
+    step_marks: Mapping[str, NDArray[Any]]
     place: Mapping[str, Any]
-    said: Sequence[Sequence[Mapping[str, Any]]] | None = None
+    persistent_language: Sequence[Sequence[Mapping[str, Any]]] | None = None
     events: Sequence[Sequence[Mapping[str, Any]]] | None = None
     train: bool = True
     statistics: Statistics | None = None

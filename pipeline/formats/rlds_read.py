@@ -200,7 +200,7 @@ def _geometry(steps: Mapping[str, Any], view: str, content: Content) -> Geometry
     return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
-def _said(value: Any) -> str | int | float:
+def _as_python_value(value: Any) -> str | int | float:
     return value.decode() if isinstance(value, bytes) else value.item()
 
 
@@ -221,7 +221,7 @@ def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
         action=steps["action"],
         action_absolute=steps["action_absolute"],
         instruction=instructions[0],
-        provenance={name: _said(steps[METADATA + name][0]) for name in content.provenance},
+        provenance={name: _as_python_value(steps[METADATA + name][0]) for name in content.provenance},
         geometry={view: _geometry(steps, view, content) for view in content.views},
         object_poses=steps["observation/object_poses"] if "object_poses" in content.extras else None,
         instances=json.loads(steps[f"{METADATA}instances"][0]) if content.has_names else (),
@@ -233,7 +233,7 @@ def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
         episode=episode,
         instructions=instructions,
         decoded={},
-        marks={name: steps[name] for name in MARKS},
+        step_marks={name: steps[name] for name in MARKS},
         place={"rlds_shard": shard.name, "rlds_index": index},
-        repeated={"file_path": ("demo_source", _said(steps[f"{METADATA}file_path"][0]))},
+        repeated={"file_path": ("demo_source", _as_python_value(steps[f"{METADATA}file_path"][0]))},
     )

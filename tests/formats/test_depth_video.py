@@ -143,9 +143,9 @@ def copied(dataset: LeRobot, episode_id: str) -> Copy:
     return copy
 
 
-def findings(check: str, made: Episode, copy: Copy, witness: bool = True) -> list[str]:
+def findings(check: str, made: Episode, copy: Copy, decodes_all_frames: bool = True) -> list[str]:
     no_replay: Any = None
-    case = Case({"instruction": made.instruction}, made, no_replay, [copy], None, witness)
+    case = Case({"instruction": made.instruction}, made, no_replay, [copy], None, decodes_all_frames)
     assert CHECKS[check].applies(case)
     return [fault.what for fault in CHECKS[check].find(case)]
 
@@ -155,8 +155,8 @@ def test_the_reader_finds_no_fault(dataset: LeRobot, episode_id: str) -> None:
     made, copy = with_maps(episode_id), copied(dataset, episode_id)
     assert {view for view, _ in copy.depth_m} == {*COLUMNS}
     for check in ("depth", "geometry", "statistics"):
-        for witness in (True, False):
-            assert findings(check, made, copy, witness) == []
+        for decodes_all_frames in (True, False):
+            assert findings(check, made, copy, decodes_all_frames) == []
 
 
 def test_other_depth_is_found(dataset: LeRobot) -> None:

@@ -74,7 +74,9 @@ def found_in_first(target: Format[Any], folder: Path) -> list[str]:
         return [str(error)]
 
 
-def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path, witness: bool = True) -> list[Fault]:
+def of_first(
+    target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path, decodes_all_frames: bool = True
+) -> list[Fault]:
     source = episode(IDS[0])
     copy = target.read(kept[IDS[0]])
     if copy is None:
@@ -86,7 +88,7 @@ def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path,
     replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), states, actions, none, Verdict(True, "kept"))
     labels = labels_of(source)
     row = {**kept[IDS[0]], **labels, "rewrites": json.dumps(labels["rewrites"]), "kept": True}
-    case = Case({**row, "instruction": source.instruction}, source, replay, [copy], None, witness)
+    case = Case({**row, "instruction": source.instruction}, source, replay, [copy], None, decodes_all_frames)
     names = ("length", "motion", "instruction", "labels", "provenance", "place", "jpeg", "geometry", "flags", "clock")
     faults = [fault for name in ("statistics", *names) for fault in CHECKS[name].find(case)]
     return [fault for fault in faults if fault.dataset == target.name]
@@ -173,11 +175,11 @@ def test_changed_statistics_of_an_episode_of_version_3_are_found(column: str, wr
 def test_a_changed_deviation_is_found_in_sampled_frames(factor: float, written: Path, tmp_path: Path) -> None:
     """Of most episodes, only three frames are decoded."""
     target = opened("lerobot", written, tmp_path)
-    assert of_first(target, rows(target), tmp_path, witness=False) == []
+    assert of_first(target, rows(target), tmp_path, decodes_all_frames=False) == []
     table = min((target.root / "meta" / "episodes").rglob("*.parquet"))
     spoil_table(table, f"stats/{IMAGE}/std", lambda value: (factor * np.array(value)).tolist())
     os.utime(target.root / "meta" / "info.json", ns=(1, 1))
-    texts = [fault.what for fault in of_first(target, rows(target), tmp_path, witness=False)]
+    texts = [fault.what for fault in of_first(target, rows(target), tmp_path, decodes_all_frames=False)]
     assert [text.startswith(f"std of {IMAGE} is") for text in texts] == [True]
 
 

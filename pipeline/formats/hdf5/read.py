@@ -216,7 +216,7 @@ def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Cop
         action=actions.astype(np.float32),
         action_absolute=group["action_absolute"][()],
         instruction=instruction,
-        provenance={name: _plain(attributes[name]) for name in content.provenance},
+        provenance={name: _as_python_value(attributes[name]) for name in content.provenance},
         geometry={view: _geometry(group, attributes, view, content) for view in content.views},
         object_poses=poses,
         instances=json.loads(attributes[layout.INSTANCES]) if content.has_names else (),
@@ -233,7 +233,7 @@ def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Cop
         episode=episode,
         instructions=[instruction] * len(actions),
         decoded=decoded,
-        marks={name: group[array][()] for name, array in MARKS.items()},
+        step_marks={name: group[array][()] for name, array in MARKS.items()},
         place={},
         train=train,
         lossless_frames=partial(_frames, place),
@@ -247,7 +247,7 @@ def scene_of(attributes: Mapping[str, Any]) -> Scene:
     return Scene(model_xml, state, start=layout.start_of(attributes))
 
 
-def _plain(value: Any) -> Any:
+def _as_python_value(value: Any) -> Any:
     """Return an attribute as Python's own type."""
     return value.item() if isinstance(value, np.generic) else value
 
