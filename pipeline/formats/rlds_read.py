@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.episode_schema import MATRICES, SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of, unlike
 from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
@@ -35,7 +35,7 @@ def open_all(root: Path) -> None:
 
 
 def check(
-    root: Path, kept: Mapping[str, Row], content: Content, validation: float = 0.0
+    root: Path, kept: Mapping[str, ManifestRow], content: Content, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
@@ -131,7 +131,7 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], content: Con
     yield from unlike("rlds", read, wanted, f"{name}: ")
 
 
-def read(root: Path, row: Row, content: Content) -> Copy | None:
+def read(root: Path, row: ManifestRow, content: Content) -> Copy | None:
     """Read a kept episode from its place in the manifest or, if that is wrong, from any other place.
 
     Raises:

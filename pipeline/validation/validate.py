@@ -21,7 +21,7 @@ from pipeline.errors import PipelineError
 from pipeline.export_config import FAILURES
 from pipeline.files import read_json, scratch
 from pipeline.formats import registry, rlds_layout
-from pipeline.formats.base import Format, Row
+from pipeline.formats.base import Format, ManifestRow
 from pipeline.formats.read_back import Fault, Written
 from pipeline.grouping import grouped
 from pipeline.physics.quality import measure
@@ -104,13 +104,13 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
     return report
 
 
-def _failed_rows(run: Run) -> dict[str, Row]:
+def _failed_rows(run: Run) -> dict[str, ManifestRow]:
     """Map the id of each written failure to its row of the manifest, with its places in the datasets of failures."""
     failures = set(run.outcome.failures) if run.config.export.failures else set()
     if not failures:
         return {}
     places = registry.places(run.failure_formats)
-    failed: dict[str, Row] = {}
+    failed: dict[str, ManifestRow] = {}
     for row in run.manifest:
         episode_id = row["episode_id"]
         if episode_id in failures:
@@ -118,7 +118,7 @@ def _failed_rows(run: Run) -> dict[str, Row]:
     return failed
 
 
-def _check_datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
+def _check_datasets(job: EpisodesJob, episodes: Mapping[str, ManifestRow], workers: Workers) -> Results:
     """Check datasets, each as a whole, and their episodes; ``job`` has all datasets."""
     total = Results()
     files = list(chain.from_iterable(dataset.written() for dataset in job.datasets))
@@ -220,7 +220,7 @@ def _unlike_stores(run: Run) -> Iterator[Fault]:
         yield from _unlike_row(row, expected)
 
 
-def _planned_rows(run: Run) -> Iterator[tuple[plan.Row, Row]]:
+def _planned_rows(run: Run) -> Iterator[tuple[plan.Row, ManifestRow]]:
     """Yield each row of the plan with its row of the manifest; ``_counts`` reports missing rows."""
     row_of = {row["episode_id"]: row for row in run.manifest}
     for planned in run.plan:
@@ -228,13 +228,13 @@ def _planned_rows(run: Run) -> Iterator[tuple[plan.Row, Row]]:
             yield planned, row_of[planned.episode_id]
 
 
-def _unlike_row(row: Row, expected: Mapping[str, Any]) -> Iterator[Fault]:
+def _unlike_row(row: ManifestRow, expected: Mapping[str, Any]) -> Iterator[Fault]:
     for column, value in expected.items():
         if row[column] != value:
             yield Fault("manifest", row["episode_id"], f"{column} is {row[column]!r}", repr(value))
 
 
-def _check_dataset(dataset: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:
+def _check_dataset(dataset: Format[Any], episodes: Mapping[str, ManifestRow], cache: Path) -> Results:
     """Check a dataset as a whole."""
     results, faults = Results(), []
     try:
@@ -259,7 +259,9 @@ def _openvla_oft(statistics: Mapping[str, Any], folder: Path, size_px: int) -> R
     return results
 
 
-def _slices(kept: Mapping[str, Row], rerendered: Collection[str], datasets: Sequence[Format[Any]]) -> list[list[Row]]:
+def _slices(
+    kept: Mapping[str, ManifestRow], rerendered: Collection[str], datasets: Sequence[Format[Any]]
+) -> list[list[ManifestRow]]:
     """Group all episodes into slices, each of which is checked in one call.
 
     Episodes to render again are grouped by trajectory, in the order of tasks, because they share a scene. The other
@@ -296,7 +298,7 @@ class EpisodesJob:
         """Ids of the ``FULLY_DECODED`` episodes of which all frames are decoded."""
         return frozenset(sorted(self.rerendered)[:FULLY_DECODED])
 
-    def __call__(self, rows: Sequence[Row]) -> Results:
+    def __call__(self, rows: Sequence[ManifestRow]) -> Results:
         results, language = Results(), self.run.config.plan.axes.language
         rewrites = {}
         for row in rows:
@@ -308,7 +310,7 @@ class EpisodesJob:
             self._check(row, load, results)
         return results
 
-    def _check(self, row: Row, load: EpisodeLoader, results: Results) -> None:
+    def _check(self, row: ManifestRow, load: EpisodeLoader, results: Results) -> None:
         episode_id = row["episode_id"]
         copies = []
         results.note("readable", [])

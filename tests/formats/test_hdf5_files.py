@@ -24,7 +24,7 @@ from synthetic import EXTRAS, IDS, NAME, TASK, episode, files, loaded_packages, 
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.hdf5 import Hdf5, Hdf5Config
 from pipeline.run.export import export
@@ -375,6 +375,6 @@ def test_a_truncated_or_missing_file_is_named(written: Hdf5) -> None:
 def test_an_attribute_that_is_lost_is_named(attribute: str, words: str, written: Hdf5) -> None:
     with h5py.File(written.folder / FILE, "r+") as file:
         del file["data/demo_0"].attrs[attribute]
-    wanted: Row = row(IDS[0])
+    wanted: ManifestRow = row(IDS[0])
     with pytest.raises(PipelineError, match=rf"(?s)data/demo_0.*{words}"):
         written.read(wanted)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.hdf5 import layout
 from pipeline.formats.hdf5.write import REPEATED
 from pipeline.formats.read_back import Copy, Fault, in_both_splits, sampled, subtasks_of, unlike
@@ -81,7 +81,7 @@ def _demos(file: Edition) -> dict[str, str]:
 
 
 def check(
-    root: Path, kept: Mapping[str, Row], content: Content, validation: float = 0.0
+    root: Path, kept: Mapping[str, ManifestRow], content: Content, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the files with the layout, and their episodes with the kept episodes."""
     split_of: dict[str, str] = {}

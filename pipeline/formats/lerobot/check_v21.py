@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.lerobot.check_shared import as_json, wrong_frames, wrong_in_dataset, wrong_tasks, wrong_video
 from pipeline.formats.lerobot.columns import (
     DATA_PATH_V21,
@@ -28,7 +28,7 @@ from pipeline.formats.stated_statistics import FIGURES
 
 
 def check(
-    folder: Path, kept: Mapping[str, Row], layout: Layout, validation: float = 0.0
+    folder: Path, kept: Mapping[str, ManifestRow], layout: Layout, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 

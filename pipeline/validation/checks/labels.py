@@ -13,8 +13,7 @@ from pipeline.episode_schema import SCHEMA, labels_of
 from pipeline.formats.annotations import event_annotations, persistent_annotations
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, exceeds_step_limit
-from pipeline.run.manifest import OWN_VERSION
-from pipeline.run.manifest import labels_of as labels_of_row
+from pipeline.run.manifest import OWN_VERSION, read_labels
 from pipeline.validation.case import Case
 
 
@@ -76,7 +75,7 @@ def _describe_other_entries(
 
 def check_labels(case: Case) -> Iterator[Fault]:
     """Check the subtasks and rewrites of the manifest, and compare all copies with the manifest."""
-    stated = labels_of_row(case.row)
+    stated = read_labels(case.row)
     if stated is None:
         yield case.finding("manifest", "has no subtasks and rewrites", "lists, which may be empty")
         return
