@@ -56,9 +56,9 @@ def half_a_code_m(distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
 def write(out: Path, frames: str = "video") -> LeRobot:
     # Rejected when a configuration is read where lerobot is older; the writer asks nothing of lerobot.
     options = LeRobotConfig(name=NAME, shards=3).model_copy(update={"depth": "video", "frames": frames})
-    target = LeRobot(out, options, CONTENT)
-    export(target, episodes(with_maps), loop)
-    return target
+    dataset = LeRobot(out, options, CONTENT)
+    export(dataset, episodes(with_maps), loop)
+    return dataset
 
 
 @pytest.fixture(scope="module")
@@ -285,13 +285,13 @@ else:
 
     @pytest.mark.parametrize("frames", ["video", "images"])
     def test_the_check_by_lerobot_finds_no_fault(tmp_path: Path, frames: str) -> None:
-        target = write(tmp_path / "data", frames)
+        dataset = write(tmp_path / "data", frames)
         kept = {episode_id: {"steps": len(with_maps(episode_id)), "demo_id": "task/demo_0"} for episode_id in IDS}
-        assert [*target.check(kept, tmp_path / "cache")] == []
-        stats = target.root / "meta" / "stats.json"
+        assert [*dataset.check(kept, tmp_path / "cache")] == []
+        stats = dataset.root / "meta" / "stats.json"
         stated = json.loads(stats.read_text())
         be_in_millimetres(stated[COLUMNS["image"]])
         stats.write_text(json.dumps(stated))
-        assert {fault.what.split(" is ")[0] for _, fault in target.check(kept, tmp_path / "cache")} >= {
+        assert {fault.what.split(" is ")[0] for _, fault in dataset.check(kept, tmp_path / "cache")} >= {
             f"mean of {COLUMNS['image']}"
         }
