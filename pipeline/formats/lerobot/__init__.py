@@ -347,7 +347,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
                 sets = by_suite(suites, self.options.name)
             for name, ids in sets.items():
                 folder = f"files/{name}" if split_name == "train" else f"files/{name}_{split_name}"
-                parts = split(ids, -(-len(ids) // EPISODES_OF_A_PIECE))
+                parts = split(ids, ceil(len(ids) / EPISODES_OF_A_PIECE))
                 slices = {f"{folder}/{number:05d}": (split_name, part) for number, part in enumerate(parts)}
                 pieces += number_pieces(slices, episodes.facts)
         return pieces
