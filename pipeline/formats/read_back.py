@@ -132,6 +132,34 @@ def subtasks_of(starts: Sequence[int], texts: Sequence[str]) -> tuple[Subtask, .
     return tuple(Subtask(int(start), str(text)) for start, text in zip(starts, texts, strict=True))
 
 
+def too_many_episodes(dataset: str, stored: int, kept: int) -> Iterator[tuple[str, Fault]]:
+    """Find a dataset with more episodes than the kept ones. Reading the episodes reports missing ones.
+
+    Args:
+        dataset: name of the format.
+        stored: number of episodes in the dataset.
+        kept: number of kept episodes.
+    """
+    if stored > kept:
+        yield "ids", Fault(dataset, None, f"has {stored} episodes, of which some are foreign or repeated", f"{kept}")
+
+
+def wrong_splits(
+    dataset: str, names: set[str], validation: float, statement: str = "the splits are"
+) -> Iterator[tuple[str, Fault]]:
+    """Compare the names of a dataset's splits with ``train`` and, with a validation share above 0, ``val``.
+
+    Args:
+        dataset: name of the format.
+        names: names of the splits.
+        validation: share of the demonstrations in ``val``.
+        statement: start of the fault's text, before the names.
+    """
+    wanted = {"train", "val"} if validation else {"train"}
+    if names != wanted:
+        yield "format", Fault(dataset, None, f"{statement} {sorted(names)}", f"{sorted(wanted)}")
+
+
 def in_both_splits(
     dataset: str, split_of: Mapping[str, str], kept: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[tuple[str, Fault]]:

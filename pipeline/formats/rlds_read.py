@@ -10,7 +10,7 @@ from pipeline.episode_schema import MATRICES, SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import ManifestRow
-from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of, unlike
+from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of, too_many_episodes, unlike, wrong_splits
 from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.rlds_write import texts as rlds_texts
@@ -62,16 +62,8 @@ def check(
                 yield "readable", Fault("rlds", None, f"{shard_name} has {counts[shard_name]} records", expected)
         yield from (("format", fault) for fault in _wrong_info(folder, info, counts, content))
         stored += sum(counts.values())
-    # Reading the episodes reports missing ones.
-    if stored > len(kept):
-        yield (
-            "ids",
-            Fault("rlds", None, f"has {stored} episodes, of which some are foreign or repeated", f"{len(kept)}"),
-        )
-    split_names = {split_of(file) for file in root.glob("*/*/*.tfrecord-*")}
-    wanted = {"train", "val"} if validation else {"train"}
-    if split_names != wanted:
-        yield "format", Fault("rlds", None, f"the splits are {sorted(split_names)}", f"{sorted(wanted)}")
+    yield from too_many_episodes("rlds", stored, len(kept))
+    yield from wrong_splits("rlds", {split_of(file) for file in root.glob("*/*/*.tfrecord-*")}, validation)
     # The check ``place`` ensures that each episode is in the shard of its row.
     splits_of = {episode_id: split_of(Path(row["rlds_shard"])) for episode_id, row in kept.items()}
     yield from in_both_splits("rlds", splits_of, kept)

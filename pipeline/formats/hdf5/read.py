@@ -17,7 +17,16 @@ from pipeline.files import Edition, edition
 from pipeline.formats.base import ManifestRow
 from pipeline.formats.hdf5 import layout
 from pipeline.formats.hdf5.write import REPEATED
-from pipeline.formats.read_back import Copy, Fault, in_both_splits, sampled, subtasks_of, unlike
+from pipeline.formats.read_back import (
+    Copy,
+    Fault,
+    in_both_splits,
+    sampled,
+    subtasks_of,
+    too_many_episodes,
+    unlike,
+    wrong_splits,
+)
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero import hdf5
 from pipeline.types import Episode, Extra, Frame, Geometry, Replay, Scene
@@ -92,13 +101,8 @@ def check(
         split_of |= dict.fromkeys(demos.values(), _split_of(root, file))
         with _readable(file), hdf5.opened(file) as opened:
             yield from (("format", fault) for fault in _wrong_file(file, opened, demos, content))
-    # Reading the episodes reports missing ones.
-    if stored > len(kept):
-        what = f"has {stored} episodes, of which some are foreign or repeated"
-        yield "ids", Fault(FORMAT, None, what, f"{len(kept)}")
-    wanted = {"train", "val"} if validation else {"train"}
-    if {*split_of.values()} != wanted:
-        yield "format", Fault(FORMAT, None, f"the splits are {sorted({*split_of.values()})}", f"{sorted(wanted)}")
+    yield from too_many_episodes(FORMAT, stored, len(kept))
+    yield from wrong_splits(FORMAT, {*split_of.values()}, validation)
     yield from in_both_splits(FORMAT, split_of, kept)
 
 

@@ -23,7 +23,7 @@ from pipeline.formats.lerobot.columns import (
 )
 from pipeline.formats.lerobot.read import readable
 from pipeline.formats.lerobot.read_v21 import VERSION, opened, read_lines, sets
-from pipeline.formats.read_back import Fault, in_both_splits, unlike
+from pipeline.formats.read_back import Fault, in_both_splits, unlike, wrong_splits
 from pipeline.formats.stated_statistics import FIGURES
 
 
@@ -55,9 +55,7 @@ def check(
     # Reading the episodes reports missing ones.
     for episode_id in split_of.keys() - kept.keys():
         yield "ids", Fault(dataset, episode_id, "is in the dataset", "only kept episodes")
-    splits, wanted = set(split_of.values()), {"train", "val"} if validation else {"train"}
-    if splits != wanted:
-        yield "format", Fault(dataset, None, f"the sets have the splits {sorted(splits)}", f"{sorted(wanted)}")
+    yield from wrong_splits(dataset, {*split_of.values()}, validation, "the sets have the splits")
     yield from in_both_splits(dataset, split_of, kept)
 
 
