@@ -181,7 +181,7 @@ def _episode_row(
     chunk, file = divmod(piece.number, FILES_OF_A_CHUNK)
     steps = len(episode)
     row = {
-        "episode_index": numbered.index,
+        "episode_index": numbered.episode_index,
         "tasks": [episode.instruction],
         "length": steps,
         "data/chunk_index": chunk,

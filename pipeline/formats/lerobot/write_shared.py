@@ -50,13 +50,13 @@ class NumberedEpisode(NamedTuple):
     """An episode with its place in the dataset.
 
     Attributes:
-        index: number of the episode.
+        episode_index: number of the episode in the dataset.
         first_step: number of preceding steps of the dataset.
         episode: the episode, with LIBERO's gripper.
         numbers: its columns of numbers, under the names of v3.0 and with the gripper of the convention.
     """
 
-    index: int
+    episode_index: int
     first_step: int
     episode: Episode
     numbers: Numbers
@@ -211,7 +211,7 @@ def _provenance_schema(content: Content) -> pa.Schema:
 def provenance_row(numbered: NumberedEpisode) -> dict[str, Any]:
     """Return an episode's row of ``meta/provenance.parquet``."""
     episode = numbered.episode
-    row: dict[str, Any] = {"episode_index": numbered.index, **episode.provenance}
+    row: dict[str, Any] = {"episode_index": numbered.episode_index, **episode.provenance}
     for view, geometry in episode.geometry.items():
         row |= {camera_column(view, name): getattr(geometry, name).ravel().tolist() for name in MATRICES}
     if episode.instances:

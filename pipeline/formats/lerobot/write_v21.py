@@ -64,7 +64,7 @@ def write_piece(path: Path, piece: Piece, load: Load, layout: Layout) -> None:
     with ExitStack() as opened:
         episodes, stats = (opened.enter_context((path / name).open("w")) for name in LINES)
         for numbered in load_each(piece, load, layout):
-            index, episode = numbered.index, numbered.episode
+            index, episode = numbered.episode_index, numbered.episode
             levels = _write_episode(path, numbered, layout)
             figures = {}
             for name, all_figures in episode_statistics(numbered.numbers, levels, layout).items():
@@ -80,7 +80,7 @@ def write_piece(path: Path, piece: Piece, load: Load, layout: Layout) -> None:
 
 def _write_episode(path: Path, numbered: NumberedEpisode, layout: Layout) -> dict[str, Counts]:
     """Write the files of one episode and return the counts of levels of its views."""
-    index, episode = numbered.index, numbered.episode
+    index, episode = numbered.episode_index, numbered.episode
     levels = {}
     for view, column in layout.views.items():
         if layout.frames == "video":
