@@ -46,6 +46,7 @@ from pipeline.compute.workers import VARIABLES
 from pipeline.config import RenderConfig
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.machine_code import ensure_fixed_machine_code
+from pipeline.rendering.model_renderer import ModelRenderer
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.rendering.savings import create_model_renderer, why_plain
@@ -67,7 +68,7 @@ Frames = np.ndarray[Any, np.dtype[np.uint8]]
 _FILE = re.compile(r'\sfile\w*="')
 """Beginning of an attribute that names a file."""
 
-KINDS: dict[str, type[PlainRenderer]] = {
+KINDS: dict[str, type[ModelRenderer]] = {
     "plain": PlainRenderer,
     "plain, 2 in flight": InFlightRenderer,
     "layers": LayeredRenderer,
@@ -245,12 +246,12 @@ def compared(workers: Sequence[Connection], names: Sequence[str], states: int) -
 
 
 def opened(workers: Sequence[Connection], name: str) -> str | None:
-    """Create a ``PlainRenderer`` of a kind in all workers, and return an error if there is one."""
+    """Create a ``ModelRenderer`` of a kind in all workers, and return an error if there is one."""
     return fault_of(asked(workers, [("open", name)] * len(workers)))
 
 
 def rendered(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
-    """Measure some workers with an open ``PlainRenderer`` at the same time."""
+    """Measure some workers with an open ``ModelRenderer`` at the same time."""
     with gpu_load() as loads:
         done = asked(workers, [("render", seconds)] * len(workers))
     fault = fault_of(done)
@@ -266,7 +267,7 @@ def rendered(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
 
 
 def profiled(workers: Sequence[Connection], seconds: float) -> dict[str, Any]:
-    """Return the milliseconds of a frame by part of the work, the mean of workers with an open ``PlainRenderer``."""
+    """Return the milliseconds of a frame by part of the work, the mean of workers with an open ``ModelRenderer``."""
     done = asked(workers, [("profile", seconds)] * len(workers))
     fault = fault_of(done)
     if fault:
@@ -298,7 +299,7 @@ def serve(connection: Connection, setup: gl.WorkerSetup, number: int, folder: Pa
     setup(number)
     scene = Scene.load(folder, next(iter(TASKS)))
     connection.send(None)
-    renderer: PlainRenderer | None = None
+    renderer: ModelRenderer | None = None
     for question in iter(connection.recv, None):
         subject, *arguments = question
         if renderer and subject not in ("render", "profile"):
@@ -325,7 +326,7 @@ def serve(connection: Connection, setup: gl.WorkerSetup, number: int, folder: Pa
         renderer.close()
 
 
-def render(scene: Scene, renderer: PlainRenderer, seconds: float) -> Work:
+def render(scene: Scene, renderer: ModelRenderer, seconds: float) -> Work:
     """Render and encode the scene's states in turn for some seconds, with both cameras."""
     work, data = Work(parts_s=dict.fromkeys(("restore", "start", "wait", "encode"), 0.0)), mujoco.MjData(scene.model)
     waiting: deque[Callable[[], Frame]] = deque()
@@ -357,7 +358,7 @@ def render(scene: Scene, renderer: PlainRenderer, seconds: float) -> Work:
     return work
 
 
-def profile(scene: Scene, renderer: PlainRenderer, seconds: float) -> Work:
+def profile(scene: Scene, renderer: ModelRenderer, seconds: float) -> Work:
     """Render like ``render``, and measure the calls of MuJoCo and the GPU's time for its pictures too."""
     spent_s: dict[str, float] = {}
     queries: list[int] = []
@@ -406,10 +407,10 @@ def compare(folder: Path, name: str, states: int) -> Pixels:
     return Pixels(frames, other, most_levels)
 
 
-def frames_of_scenes(folder: Path, kind: type[PlainRenderer], states: int) -> Iterator[Frames]:
+def frames_of_scenes(folder: Path, kind: type[ModelRenderer], states: int) -> Iterator[Frames]:
     """Yield the frames of each scene, without and with shadows; following scenes share a context if possible."""
     with ExitStack() as opened:
-        renderer: PlainRenderer | None = None
+        renderer: ModelRenderer | None = None
         for task, shadows in product(TASKS, (False, True)):
             scene = Scene.load(folder, task)
             scene.model.light_castshadow[:] |= shadows
@@ -419,7 +420,7 @@ def frames_of_scenes(folder: Path, kind: type[PlainRenderer], states: int) -> It
             yield frames_of(scene, renderer, states)
 
 
-def frames_of(scene: Scene, renderer: PlainRenderer, states: int) -> Frames:
+def frames_of(scene: Scene, renderer: ModelRenderer, states: int) -> Frames:
     """Render some states, from the first to the last, with both cameras, (N, H, W, 3)."""
     data = mujoco.MjData(scene.model)
     waiting: list[Callable[[], Frame]] = []

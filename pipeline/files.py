@@ -108,13 +108,13 @@ def replaced(path: Path) -> Iterator[Path]:
         _discard(temporary)
 
 
-def put_in_place(whole: Path, path: Path) -> None:
+def put_in_place(complete: Path, path: Path) -> None:
     """Sync a file or a folder of the same file system to disk, and replace ``path`` with it."""
-    sync(whole)
+    sync(complete)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if whole.is_dir():
+    if complete.is_dir():
         remove(path)
-    os.replace(whole, path)
+    os.replace(complete, path)
     _sync(path.parent)
 
 
@@ -144,13 +144,13 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def keep_below(folder: Path, files: set[Path], made: Callable[[Path], bool] = lambda path: True) -> None:
+def keep_below(folder: Path, files: set[Path], is_ours: Callable[[Path], bool] = lambda path: True) -> None:
     """Delete every file below ``folder`` that is neither one of ``files`` nor inside one, then delete empty folders.
 
     Deleted files are, for example, shards of an earlier plan, and temporaries of a killed run.
 
     Args:
-        made: function that returns True for a file of this project. All other files stay.
+        is_ours: function that returns True for a file of this project. All other files stay.
     """
     if not folder.is_dir():
         return
@@ -158,9 +158,9 @@ def keep_below(folder: Path, files: set[Path], made: Callable[[Path], bool] = la
         if entry in files:
             continue
         if entry.is_dir() and not entry.is_symlink() and not is_temporary(entry.name):
-            keep_below(entry, files, made)
+            keep_below(entry, files, is_ours)
             remove_if_empty(entry)
-        elif is_temporary(entry.name) or made(entry):
+        elif is_temporary(entry.name) or is_ours(entry):
             remove(entry)
 
 

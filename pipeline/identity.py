@@ -12,7 +12,7 @@
 8. A file is named after its inputs, and is up to date if it has today's fingerprint. Else it counts as missing.
 9. A stage with few outputs (an export, ``validate``, ``summary``) has one record of all its inputs and outputs.
    The record (``pipeline/record.py``) also states why work is not up to date.
-10. Before finished files of today's plan are generated again, a person must allow it (``reject_unasked``).
+10. Before finished files of today's plan are generated again, a person must allow it (``require_remake_permission``).
 """
 
 import os
@@ -156,20 +156,20 @@ def remake_allowed() -> bool:
     return os.environ.get(REMAKE) == "1"
 
 
-def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
+def require_remake_permission(outdated_files: Counter[str], where: Path, allow: str = ALLOW) -> None:
     """Report the finished files that would be generated again, and stop unless a person allowed it.
 
     Args:
-        found: kind of files and reason, to the number of files.
+        outdated_files: kind of files and reason, to the number of files.
         where: folder of the files.
         allow: ways to allow it, in words.
 
     Raises:
         PipelineError: when there are such files, and the environment does not allow it. Nothing was changed.
     """
-    if not found:
+    if not outdated_files:
         return
-    outdated = describe_outdated(found)
+    outdated = describe_outdated(outdated_files)
     if remake_allowed():
         print(f"generating again: {outdated}")
         return
@@ -181,9 +181,9 @@ def reject_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
     )
 
 
-def describe_outdated(found: Counter[str]) -> str:
+def describe_outdated(outdated_files: Counter[str]) -> str:
     """List numbers of files, each with their kind and the reason."""
-    return "; ".join(f"{number} {kind}" for kind, number in found.items())
+    return "; ".join(f"{number} {kind}" for kind, number in outdated_files.items())
 
 
 @cache

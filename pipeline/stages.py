@@ -20,7 +20,7 @@ from pipeline.files import read_json, write, write_json
 from pipeline.formats import exact_statistics, registry
 from pipeline.formats.episodes import by_suite
 from pipeline.formats.rlds import Rlds
-from pipeline.identity import reject_unasked
+from pipeline.identity import require_remake_permission
 from pipeline.planning import leakage, plan
 from pipeline.run import counts, dataset_files, dropped, export, finished, inputs, machine, manifest, plan_stage
 from pipeline.run.claim import claim_folder, locked
@@ -152,7 +152,7 @@ def replay(run: Run) -> None:
     """Replay and judge every planned trajectory, without OpenGL; a stopped stage resumes."""
     rows, config = run.plan, run.config
     plan.reject_other_settings(rows, config.replay)
-    reject_unasked(join_kinds(outdated(rows, run.trajectories, run.frames)), run.folder)
+    require_remake_permission(join_kinds(outdated(rows, run.trajectories, run.frames)), run.folder)
     dropped.reject_deletion(rows, run)
     with run.workers() as workers:
         replays = Replays(config.demos, config.replay, run.trajectories, workers, config.filter)
@@ -173,7 +173,7 @@ def render(run: Run) -> None:
     rows, config = run.plan, run.config
     plan.reject_other_settings(rows, config.replay)
     outdated_files = outdated(rows, run.trajectories, run.frames, gl.choose().device)
-    reject_unasked(join_kinds(outdated_files), run.folder)
+    require_remake_permission(join_kinds(outdated_files), run.folder)
     dropped.reject_deletion(rows, run)
     # The configuration may have changed since the plan was written.
     config.export.reject_too_few(plan.count_demonstrations(rows))

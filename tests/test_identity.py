@@ -56,4 +56,4 @@ def test_another_quality_and_another_shape_of_frames_are_other_frames(
 def test_only_remake_1_allows_it(value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(identity.REMAKE, value)
     with pytest.raises(PipelineError, match="finished work would be generated again: 2 files"):
-        identity.reject_unasked(Counter({"files": 2}), tmp_path)
+        identity.require_remake_permission(Counter({"files": 2}), tmp_path)

@@ -108,7 +108,7 @@ class Evaluation:
             reason = None if row is None else _record(row).why_not(self.basis(task), PER_TASK)
             if reason is not None:
                 outdated[f"episodes, generated with {reason}"] += 1
-        identity.reject_unasked(outdated, self.folder, REMAKE)
+        identity.require_remake_permission(outdated, self.folder, REMAKE)
 
     def basis(self, task: EvaluationTask) -> Basis:
         """Return everything that the result of an episode depends on."""

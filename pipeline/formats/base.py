@@ -22,7 +22,7 @@ from pipeline.identity import made_with_recipe
 from pipeline.record import Basis, Record
 from pipeline.types import LONGEST_NAME, Frozen
 
-Row = Mapping[str, Any]
+ManifestRow = Mapping[str, Any]
 """A row of the manifest."""
 
 
@@ -281,7 +281,7 @@ class Format(ABC, Generic[Options]):
         """
 
     @abstractmethod
-    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+    def check(self, kept: Mapping[str, ManifestRow], cache: Path) -> Iterator[tuple[str, Fault]]:
         """List the faults of the dataset as a whole.
 
         Each fault comes with the name of its check: ``format``, ``ids``, ``splits`` or ``readable``.
@@ -295,7 +295,7 @@ class Format(ABC, Generic[Options]):
         """
 
     @abstractmethod
-    def read(self, row: Row) -> Copy | None:
+    def read(self, row: ManifestRow) -> Copy | None:
         """Read an episode, wherever the dataset has it; ``None`` when the dataset does not have it.
 
         Raises:
@@ -321,7 +321,7 @@ class Format(ABC, Generic[Options]):
         return []
 
     @abstractmethod
-    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+    def loading(self, name: str, repository: str, kept: Sequence[ManifestRow]) -> str:
         """Return the card's section on loading the dataset, in Markdown.
 
         Args:

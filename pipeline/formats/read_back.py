@@ -60,10 +60,11 @@ class Copy:
             instruction of the first step, and frames only if they are image files.
         instructions: one for each step.
         decoded: (view, step) to the frame, for ``sampled`` steps, where frames are a video.
-        marks: further columns of each step, by the dataset's own names, each (T,).
+        step_marks: further columns of each step, by the dataset's own names, each (T,).
         place: place of the episode, by the format's columns of the manifest.
         repeated: further name of a column of the provenance, to that column and the value under the further name.
-        said: lerobot's column of persistent language, the entries of each step; ``None`` where the dataset has none.
+        persistent_language: lerobot's column of persistent language, the entries of each step; ``None`` where the
+            dataset has none.
         events: lerobot's column of language events, likewise.
         train: True if the episode is in the training split.
         statistics: statistics of the episode; ``None`` where the dataset states none.
@@ -76,9 +77,9 @@ class Copy:
     episode: Episode
     instructions: Sequence[str]
     decoded: Mapping[tuple[str, int], Frame]
-    marks: Mapping[str, NDArray[Any]]
+    step_marks: Mapping[str, NDArray[Any]]
     place: Mapping[str, Any]
-    said: Sequence[Sequence[Mapping[str, Any]]] | None = None
+    persistent_language: Sequence[Sequence[Mapping[str, Any]]] | None = None
     events: Sequence[Sequence[Mapping[str, Any]]] | None = None
     train: bool = True
     statistics: Statistics | None = None
@@ -129,6 +130,34 @@ def subtasks_of(starts: Sequence[int], texts: Sequence[str]) -> tuple[Subtask, .
         ValueError: when they differ in length.
     """
     return tuple(Subtask(int(start), str(text)) for start, text in zip(starts, texts, strict=True))
+
+
+def too_many_episodes(dataset: str, stored: int, kept: int) -> Iterator[tuple[str, Fault]]:
+    """Find a dataset with more episodes than the kept ones. Reading the episodes reports missing ones.
+
+    Args:
+        dataset: name of the format.
+        stored: number of episodes in the dataset.
+        kept: number of kept episodes.
+    """
+    if stored > kept:
+        yield "ids", Fault(dataset, None, f"has {stored} episodes, of which some are foreign or repeated", f"{kept}")
+
+
+def wrong_splits(
+    dataset: str, names: set[str], validation: float, statement: str = "the splits are"
+) -> Iterator[tuple[str, Fault]]:
+    """Compare the names of a dataset's splits with ``train`` and, with a validation share above 0, ``val``.
+
+    Args:
+        dataset: name of the format.
+        names: names of the splits.
+        validation: share of the demonstrations in ``val``.
+        statement: start of the fault's text, before the names.
+    """
+    wanted = {"train", "val"} if validation else {"train"}
+    if names != wanted:
+        yield "format", Fault(dataset, None, f"{statement} {sorted(names)}", f"{sorted(wanted)}")
 
 
 def in_both_splits(

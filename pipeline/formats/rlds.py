@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import pyarrow as pa
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, STANDARD, Content
-from pipeline.formats.base import CardFacts, Format, FormatOptions, Name, Row, StepSizes, ValidationShare
+from pipeline.formats.base import CardFacts, Format, FormatOptions, ManifestRow, Name, StepSizes, ValidationShare
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, dataset_of, shard_path
@@ -113,17 +113,17 @@ class Rlds(Format[RldsConfig]):
 
         rlds_read.open_all(self.folder)
 
-    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+    def check(self, kept: Mapping[str, ManifestRow], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import rlds_read
 
         return rlds_read.check(self.folder, kept, self.content, self.options.validation)
 
-    def read(self, row: Row) -> Copy | None:
+    def read(self, row: ManifestRow) -> Copy | None:
         from pipeline.formats import rlds_read
 
         return rlds_read.read(self.folder, row, self.content)
 
-    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+    def loading(self, name: str, repository: str, kept: Sequence[ManifestRow]) -> str:
         builders = ""
         for dataset in sorted({dataset_of(row) for row in kept}):
             builders += f"""\

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 
 VERSION = "1.0.0"
 
@@ -30,6 +30,6 @@ def split_of(shard: Path) -> str:
     return shard.name.partition(".")[0].rpartition("-")[2]
 
 
-def dataset_of(row: Row) -> str:
+def dataset_of(row: ManifestRow) -> str:
     """Return the name of a kept episode's set, which is the prefix of its shard's name."""
     return str(row["rlds_shard"]).partition("-")[0]

@@ -9,8 +9,8 @@ from typing import Any
 from pipeline.episode_schema import MATRICES, SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
-from pipeline.formats.base import Row
-from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of, unlike
+from pipeline.formats.base import ManifestRow
+from pipeline.formats.read_back import Copy, Fault, in_both_splits, subtasks_of, too_many_episodes, unlike, wrong_splits
 from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.rlds_write import texts as rlds_texts
@@ -35,7 +35,7 @@ def open_all(root: Path) -> None:
 
 
 def check(
-    root: Path, kept: Mapping[str, Row], content: Content, validation: float = 0.0
+    root: Path, kept: Mapping[str, ManifestRow], content: Content, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
@@ -62,16 +62,8 @@ def check(
                 yield "readable", Fault("rlds", None, f"{shard_name} has {counts[shard_name]} records", expected)
         yield from (("format", fault) for fault in _wrong_info(folder, info, counts, content))
         stored += sum(counts.values())
-    # Reading the episodes reports missing ones.
-    if stored > len(kept):
-        yield (
-            "ids",
-            Fault("rlds", None, f"has {stored} episodes, of which some are foreign or repeated", f"{len(kept)}"),
-        )
-    split_names = {split_of(file) for file in root.glob("*/*/*.tfrecord-*")}
-    wanted = {"train", "val"} if validation else {"train"}
-    if split_names != wanted:
-        yield "format", Fault("rlds", None, f"the splits are {sorted(split_names)}", f"{sorted(wanted)}")
+    yield from too_many_episodes("rlds", stored, len(kept))
+    yield from wrong_splits("rlds", {split_of(file) for file in root.glob("*/*/*.tfrecord-*")}, validation)
     # The check ``place`` ensures that each episode is in the shard of its row.
     splits_of = {episode_id: split_of(Path(row["rlds_shard"])) for episode_id, row in kept.items()}
     yield from in_both_splits("rlds", splits_of, kept)
@@ -131,7 +123,7 @@ def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], content: Con
     yield from unlike("rlds", read, wanted, f"{name}: ")
 
 
-def read(root: Path, row: Row, content: Content) -> Copy | None:
+def read(root: Path, row: ManifestRow, content: Content) -> Copy | None:
     """Read a kept episode from its place in the manifest or, if that is wrong, from any other place.
 
     Raises:
@@ -200,7 +192,7 @@ def _geometry(steps: Mapping[str, Any], view: str, content: Content) -> Geometry
     return Geometry(**matrices, maps=maps, boxes=boxes)
 
 
-def _said(value: Any) -> str | int | float:
+def _as_python_value(value: Any) -> str | int | float:
     return value.decode() if isinstance(value, bytes) else value.item()
 
 
@@ -221,7 +213,7 @@ def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
         action=steps["action"],
         action_absolute=steps["action_absolute"],
         instruction=instructions[0],
-        provenance={name: _said(steps[METADATA + name][0]) for name in content.provenance},
+        provenance={name: _as_python_value(steps[METADATA + name][0]) for name in content.provenance},
         geometry={view: _geometry(steps, view, content) for view in content.views},
         object_poses=steps["observation/object_poses"] if "object_poses" in content.extras else None,
         instances=json.loads(steps[f"{METADATA}instances"][0]) if content.has_names else (),
@@ -233,7 +225,7 @@ def _copy(steps: Mapping[str, Any], place: Place, content: Content) -> Copy:
         episode=episode,
         instructions=instructions,
         decoded={},
-        marks={name: steps[name] for name in MARKS},
+        step_marks={name: steps[name] for name in MARKS},
         place={"rlds_shard": shard.name, "rlds_index": index},
-        repeated={"file_path": ("demo_source", _said(steps[f"{METADATA}file_path"][0]))},
+        repeated={"file_path": ("demo_source", _as_python_value(steps[f"{METADATA}file_path"][0]))},
     )

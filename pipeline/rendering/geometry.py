@@ -16,7 +16,7 @@ from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero.carried import definition_of
 from pipeline.planning.streams import Stream
-from pipeline.rendering.plain_renderer import Surfaces
+from pipeline.rendering.model_renderer import Surfaces
 from pipeline.rendering.renderer import Renderer
 from pipeline.scenes.placement import added_names, added_objects
 from pipeline.types import Extra, Floats, Geometry, Task, Trajectory

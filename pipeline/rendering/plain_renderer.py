@@ -3,9 +3,8 @@
 Subclasses of ``PlainRenderer`` (``savings.py``) must render equal pixels.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import ExitStack
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,24 +13,12 @@ from numpy.typing import NDArray
 
 from pipeline import gl
 from pipeline.episode_schema import SIZE_PX
+from pipeline.rendering.model_renderer import ModelRenderer, Surfaces
 from pipeline.rendering.opengl import check, making_context
 from pipeline.types import Frame
 
 MOST_GEOMS = 1000
 """Largest number of geoms, sites and other elements of a scene that MuJoCo renders; LIBERO's scenes have up to 300."""
-
-
-class Surfaces(NamedTuple):
-    """Depth, and geom or site, of each pixel, in the orientation of LIBERO's raw observations.
-
-    Attributes:
-        depth_m: (H, W) float32, along the camera's viewing axis.
-        number, kind: (H, W) the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 without a surface.
-    """
-
-    depth_m: NDArray[np.float32]
-    number: NDArray[np.int32]
-    kind: NDArray[np.int32]
 
 
 def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> list[NDArray[np.uint8]]:
@@ -41,31 +28,8 @@ def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> 
     return [data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
 
 
-class PlainRenderer:
-    """Rendering of a whole model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in its own context.
-
-    Close it before you create the next ``PlainRenderer``.
-
-    Args:
-        model: the model, which must not be replaced.
-        size_px: height and width of its frames.
-
-    Attributes:
-        steps_ahead: number of steps, of up to two views each, to start by ``start_frame`` before the frames of an
-            earlier step are taken; 0 if the device does not work meanwhile.
-        adopts: True if the context may be able to switch to another model (``adopt``).
-
-    Raises:
-        PipelineError: if this machine cannot render.
-    """
-
-    steps_ahead = 0
-    adopts = False
-
-    @staticmethod
-    def possible(model: mujoco.MjModel) -> bool:
-        """Return whether this class can render a model; ``PlainRenderer`` can render every model."""
-        return True
+class PlainRenderer(ModelRenderer):
+    """Rendering of a whole model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``."""
 
     def __init__(self, model: mujoco.MjModel, size_px: int = SIZE_PX):
         gl.prepare()
@@ -89,38 +53,12 @@ class PlainRenderer:
         # Render visual meshes without the collision geometry, like robosuite's off-screen context.
         self._option.geomgroup[0] = 0
 
-    def adopt(self, model: mujoco.MjModel) -> bool:
-        """Switch to another model in the same OpenGL context if possible, and return whether it was; here it never is.
-
-        If the result is False, nothing has changed. After an error, close this ``PlainRenderer``.
-        """
-        return False
-
-    def release(self) -> None:
-        """Drop the reference to the model, so that its memory can be freed.
-
-        Call it only if ``adopts`` is true. Only ``adopt`` or ``close`` may follow.
-        """
-
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:
-        """Render a frame (H, W, 3) of uint8 RGB, in the orientation of LIBERO's raw observations.
-
-        Call ``mj_forward`` on the data before.
-        """
         self._gl.make_current()
         self._render_frame(data, camera)
         return self._pixels()
 
-    def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
-        """Start to render a frame, and return a function that waits for the frame and returns it.
-
-        The state may change meanwhile. Here the frame is rendered at once; subclasses let the device continue to work.
-        """
-        frame = self.frame(data, camera)
-        return lambda: frame
-
     def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
-        """Render the depth, and the geom or site, of each pixel of a frame."""
         self._gl.make_current()
         groups = self._model.site_group.copy()
         # robosuite hides sites by a negative opacity. A segmentation would show all sites with an opacity other than 0.
@@ -151,7 +89,6 @@ class PlainRenderer:
         return Surfaces(depth_m.astype(np.float32), number, kind)
 
     def load(self, textures: Collection[int]) -> None:
-        """Upload these textures from the model's ``tex_data``."""
         self._gl.make_current()
         for texture in textures:
             mujoco.mjr_uploadTexture(self._model, self._context, texture)

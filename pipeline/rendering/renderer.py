@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SIZE_PX
-from pipeline.rendering.plain_renderer import PlainRenderer, Surfaces, texels
+from pipeline.rendering.model_renderer import ModelRenderer, Surfaces
+from pipeline.rendering.plain_renderer import texels
 from pipeline.rendering.savings import create_model_renderer
 from pipeline.scenes.compiled import compile_model
 from pipeline.types import Frame, State
@@ -23,15 +24,15 @@ class Renderer:
 
     Args:
         scene: the scene's MJCF, or a compiled model, which then belongs to the renderer.
-        model_renderer: an open ``PlainRenderer`` of the model; by default it is created.
-        size_px: height and width of the frames; an open ``PlainRenderer`` has its own.
+        model_renderer: an open ``ModelRenderer`` of the model; by default it is created.
+        size_px: height and width of the frames; an open ``ModelRenderer`` has its own.
 
     Attributes:
         site_alpha: (nsite,) the sites' opacity in the first state.
     """
 
     def __init__(
-        self, scene: str | mujoco.MjModel, model_renderer: PlainRenderer | None = None, size_px: int = SIZE_PX
+        self, scene: str | mujoco.MjModel, model_renderer: ModelRenderer | None = None, size_px: int = SIZE_PX
     ):
         self.model = compile_model(scene) if isinstance(scene, str) else scene
         self.site_alpha = self.model.site_rgba[:, 3].copy()
@@ -115,11 +116,11 @@ class LastScene:
     """Holder of the open renderer; at most one renderer is open at a time.
 
     Repeated requests for a scene return its renderer. A request for another scene returns a new renderer. It takes over
-    the ``PlainRenderer`` and its OpenGL context if ``adopt`` accepts the scene.
+    the ``ModelRenderer`` and its OpenGL context if ``adopt`` accepts the scene.
     """
 
     def __init__(self) -> None:
-        self._model_renderer: PlainRenderer | None = None
+        self._model_renderer: ModelRenderer | None = None
         self._renderer: Renderer | None = None
         self._scene: str | mujoco.MjModel | None = None
 

@@ -20,6 +20,7 @@ import numpy as np
 from pipeline import gl
 from pipeline.episode_schema import SIZE_PX
 from pipeline.errors import PipelineError
+from pipeline.rendering.model_renderer import ModelRenderer
 from pipeline.rendering.plain_renderer import PlainRenderer
 from pipeline.types import Frame
 
@@ -72,8 +73,8 @@ SCENE = f"""
 </mujoco>"""
 
 
-def create_model_renderer(model: mujoco.MjModel, size_px: int = SIZE_PX) -> PlainRenderer:
-    """Create the ``PlainRenderer`` of a model, with savings if they can be used."""
+def create_model_renderer(model: mujoco.MjModel, size_px: int = SIZE_PX) -> ModelRenderer:
+    """Create the ``ModelRenderer`` of a model, with savings if they can be used."""
     if why_plain(size_px) is None:
         kind = kind_with_savings(gl.choose())
         if kind.possible(model):
@@ -82,8 +83,8 @@ def create_model_renderer(model: mujoco.MjModel, size_px: int = SIZE_PX) -> Plai
     return PlainRenderer(model, size_px)
 
 
-def kind_with_savings(choice: gl.GlChoice) -> type[PlainRenderer]:
-    """Return the kind of ``PlainRenderer`` that renders fastest on a device.
+def kind_with_savings(choice: gl.GlChoice) -> type[ModelRenderer]:
+    """Return the kind of ``ModelRenderer`` that renders fastest on a device.
 
     In software, rendering a face takes longer than the choice of faces, so all savings are used. A GPU that few
     processes use would wait for their choice of geoms, so all geoms are rendered, with frames in flight.
@@ -131,7 +132,7 @@ def _say(reason: str) -> None:
     logging.getLogger(__name__).warning("rendering optimizations are disabled: %s", reason)
 
 
-def fault(kind: type[PlainRenderer], size_px: int = SIZE_PX) -> str | None:
+def fault(kind: type[ModelRenderer], size_px: int = SIZE_PX) -> str | None:
     """Return the error or the difference that savings of a kind cause here; ``None`` if all pixels are equal."""
     try:
         plain, saving = frames(PlainRenderer, size_px), frames(kind, size_px)
@@ -142,8 +143,8 @@ def fault(kind: type[PlainRenderer], size_px: int = SIZE_PX) -> str | None:
     return f"{differing} of {len(plain)} frames of a small scene have other pixels" if differing else None
 
 
-def frames(kind: type[PlainRenderer], size_px: int = SIZE_PX) -> list[Frame]:
-    """Render the small scene in all states by one kind of ``PlainRenderer``."""
+def frames(kind: type[ModelRenderer], size_px: int = SIZE_PX) -> list[Frame]:
+    """Render the small scene in all states by one kind of ``ModelRenderer``."""
     model = mujoco.MjModel.from_xml_string(SCENE)
     data, started = mujoco.MjData(model), []
     with closing(kind(model, size_px)) as renderer:

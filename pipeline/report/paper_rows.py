@@ -39,7 +39,7 @@ MARKUP = re.compile(r"[\\`*<|~\[]|&(?=[#\w])|(?<![^\W_])_|_(?![^\W_])")
 """Characters that Markdown does not print as they are; an underscore inside a word is printed."""
 
 
-class Row(NamedTuple):
+class ModelRow(NamedTuple):
     """One model's row, with each number as all formats print it.
 
     Attributes:
@@ -70,7 +70,7 @@ class Row(NamedTuple):
     absent: Mapping[str, str]
 
 
-def rows_of(table: Mapping[str, Any]) -> list[Row]:
+def rows_of(table: Mapping[str, Any]) -> list[ModelRow]:
     """Return the rows of a table: evaluated policies, then published models.
 
     Args:
@@ -82,7 +82,7 @@ def rows_of(table: Mapping[str, Any]) -> list[Row]:
     ]
 
 
-def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
+def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> ModelRow:
     """Return the row of an evaluated policy.
 
     Args:
@@ -102,7 +102,7 @@ def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
         if heading in measured and heading not in partial and counts[counted] < whole[counted]:
             sampled[heading] = f"{counts[counted]:,} of {whole[counted]:,}"
     fewest, most = protocol["trials"]
-    return Row(
+    return ModelRow(
         name=row["name"],
         published=False,
         program=protocol["program"],
@@ -123,11 +123,11 @@ def _evaluated(row: Mapping[str, Any], sizes: Mapping[str, int]) -> Row:
     )
 
 
-def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> Row:
+def _published(row: Mapping[str, Any], table: Mapping[str, Any]) -> ModelRow:
     """Return the row of a published model, whose rates are in percent."""
     protocol = table["protocol"]
     rates = {**row["rates"], "total": row["total"], "mean of seven": row["mean"]}
-    return Row(
+    return ModelRow(
         name=row["name"],
         published=True,
         program=table["source"],
@@ -196,7 +196,7 @@ def _escaped(name: str) -> str:
     return MARKUP.sub(r"\\\g<0>", " ".join(name.split()))
 
 
-def _marked(row: Row, heading: str, star: str, dagger: str) -> str:
+def _marked(row: ModelRow, heading: str, star: str, dagger: str) -> str:
     """Return a rate, empty if it was not measured.
 
     A star marks a rate without a part of the benchmark, a dagger another estimate from some of the test tasks.
@@ -209,7 +209,7 @@ def _marked(row: Row, heading: str, star: str, dagger: str) -> str:
     return rate + dagger if heading in row.sampled else rate
 
 
-def _notes(row: Row) -> Iterator[str]:
+def _notes(row: ModelRow) -> Iterator[str]:
     """Yield the protocol of an evaluated policy and its left-out parts, each as a line of a Markdown list."""
     if row.published:
         return
@@ -221,11 +221,11 @@ def _notes(row: Row) -> Iterator[str]:
         yield f"- † {name}: estimated from some of the tasks, {_sampled(row)}."
 
 
-def _sampled(row: Row) -> str:
+def _sampled(row: ModelRow) -> str:
     return ", ".join(f"{heading} {count}" for heading, count in row.sampled.items())
 
 
-def _protocol(row: Row) -> str:
+def _protocol(row: ModelRow) -> str:
     """Describe the protocol of an evaluated policy."""
     trials = "trial" if row.trials == "1" else "trials"
     black = "" if row.black == "none" else f"; black views {row.black}"

@@ -186,15 +186,15 @@ def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
     plots_and_tables = {}
     perturbed_on: dict[str, list[tuple[Mapping[str, Any], Perturbation]]] = {}
     for row in tried:
-        for made in from_json(row["perturbations"]):
-            perturbed_on.setdefault(made.axis, []).append((row, made))
+        for perturbation in from_json(row["perturbations"]):
+            perturbed_on.setdefault(perturbation.axis, []).append((row, perturbation))
     for axis, of_axis in perturbed_on.items():
         table = yields.by_level("Kept/planned episodes, by component", [row for row, _ in of_axis], axis)
         kept = []
-        for row, made in of_axis:
+        for row, perturbation in of_axis:
             if row["kept"]:
                 resolved = json.loads(row["resolved"]).get(axis)
-                kept.append(KeptPerturbation(_task(row), made, resolved))
+                kept.append(KeptPerturbation(_task(row), perturbation, resolved))
         plots_and_tables[axis] = coverage.plot_axis(axis, kept, test), table
     return plots_and_tables
 
@@ -207,11 +207,11 @@ def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
     """Quote class and level, original instruction and rewrite, with the classes in turn."""
     quoted: dict[str, list[tuple[str, str, str]]] = {}
     for row in kept:
-        for made in from_json(row["perturbations"]):
-            if isinstance(made, TextPerturbation):
+        for perturbation in from_json(row["perturbations"]):
+            if isinstance(perturbation, TextPerturbation):
                 original = _task(row).instruction
-                label = f"{made.component.replace('_', ' ')}, level {made.level}"
-                quoted.setdefault(made.component, []).append((label, original, row["instruction"]))
+                label = f"{perturbation.component.replace('_', ' ')}, level {perturbation.level}"
+                quoted.setdefault(perturbation.component, []).append((label, original, row["instruction"]))
     dealt = chain.from_iterable(zip_longest(*quoted.values()))
     return list(islice(filter(None, dealt), REWRITES))
 
@@ -244,7 +244,7 @@ def _agent_view(row: Mapping[str, Any]) -> tuple[object, str]:
 
 
 def _level(row: Mapping[str, Any]) -> int:
-    return max(made.level for made in from_json(row["perturbations"]))
+    return max(perturbation.level for perturbation in from_json(row["perturbations"]))
 
 
 def _pictures(folder: Path) -> dict[str, str]:

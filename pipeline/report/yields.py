@@ -77,10 +77,10 @@ def by_level(title: str, tried: Rows, axis: str | None = None) -> Table:
     """
     cells: dict[str, dict[int, list[Mapping[str, Any]]]] = {}
     for row in tried:
-        for made in from_json(row["perturbations"]):
-            if axis in (None, made.axis):
-                name = made.axis if axis is None else made.component.replace("_", " ")
-                cells.setdefault(name, defaultdict(list))[made.level].append(row)
+        for perturbation in from_json(row["perturbations"]):
+            if axis in (None, perturbation.axis):
+                name = perturbation.axis if axis is None else perturbation.component.replace("_", " ")
+                cells.setdefault(name, defaultdict(list))[perturbation.level].append(row)
     body: list[tuple[Cell, ...]] = []
     for name, rows_of_level in cells.items():
         by_levels = [_kept(Counts.of(rows_of_level[level])) for level in LEVELS]

@@ -28,7 +28,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import remove
 from pipeline.grouping import grouped
-from pipeline.identity import DISTRIBUTION, REMAKE, reject_unasked, remake_allowed
+from pipeline.identity import DISTRIBUTION, REMAKE, remake_allowed, require_remake_permission
 from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
@@ -94,7 +94,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
         _reject_other_demonstrations(file)
         outputs.reject_other_file(file)
     store = TrajectoryStore(out / ".replays")
-    reject_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
+    require_remake_permission(store.outdated({row.trajectory_id for row in rows}), store.root)
     faults: dict[str, str] = {}
     while True:
         verdicts = Replays(demos, REPLAY, store, workers).complete(rows, faults)

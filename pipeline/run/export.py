@@ -28,7 +28,7 @@ from pipeline.files import (
 )
 from pipeline.formats.base import AnyFormat, DatasetRecord
 from pipeline.formats.episodes import Episodes, Load, Piece
-from pipeline.identity import reject_unasked
+from pipeline.identity import require_remake_permission
 from pipeline.run.dataset_basis import compute_basis, episodes_of, is_up_to_date, outdated
 from pipeline.run.dataset_files import (
     PUT_AWAY,
@@ -76,7 +76,7 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
         remove_unneeded_files(target)
         print(f"{target.folder} is up to date, with {len(episodes.ids)} episodes: see {target.record_file}")
         return
-    reject_unasked(outdated(target, episodes), target.folder)
+    require_remake_permission(outdated(target, episodes), target.folder)
     with run.workers() as workers:
         export(target, episodes, workers)
     print(f"wrote {len(episodes.ids)} episodes to {target.folder}")

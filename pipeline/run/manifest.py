@@ -184,7 +184,7 @@ def read(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def labels_of(row: Mapping[str, Any]) -> dict[str, list[Any]] | None:
+def read_labels(row: Mapping[str, Any]) -> dict[str, list[Any]] | None:
     """Return the subtasks and rewrites of an episode's row, as the lists of a dataset; `None` if the row has none."""
     labels = {name: row[name] for name in SCHEMA.labels}
     if None in labels.values():

@@ -134,7 +134,7 @@ def outdated(
     """Count the stored files of a plan that this version, or this machine, would generate again, by kind and reason.
 
     The count includes finished files of today's plan, with today's settings, that were generated with other recipes,
-    packages, machine code or another OpenGL device: see ``identity.reject_unasked``. Files that a changed
+    packages, machine code or another OpenGL device: see ``identity.require_remake_permission``. Files that a changed
     configuration or plan replaces are not counted: ``dropped.reject_deletion`` reports them.
 
     Args:

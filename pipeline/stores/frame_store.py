@@ -230,8 +230,8 @@ def frames_by_trajectory(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Sto
     return stored
 
 
-def _subtasks(text: str) -> tuple[Subtask, ...]:
-    return tuple(Subtask(step, text) for step, text in json.loads(text))
+def _subtasks(subtasks_json: str) -> tuple[Subtask, ...]:
+    return tuple(Subtask(step, text) for step, text in json.loads(subtasks_json))
 
 
 def merged(parts: Sequence[Rendered]) -> Rendered:

@@ -47,19 +47,19 @@ class Case:
 
     Attributes:
         row: its row of the manifest.
-        made: the episode in the run's stores.
+        episode: the episode in the run's stores.
         trajectory: the replay that it was rendered from.
         copies: the episode in each dataset from which it could be read.
         bank: the run's own bank of rewrites.
-        witness: True if all frames of the episode are decoded, which is done for a few episodes only.
+        decodes_all_frames: True if all frames of the episode are decoded, which is done for a few episodes only.
     """
 
     row: Mapping[str, Any]
-    made: Episode
+    episode: Episode
     trajectory: Trajectory
     copies: Sequence[Copy]
     bank: Path | None
-    witness: bool = False
+    decodes_all_frames: bool = False
 
     @cached_property
     def task(self) -> Task:
@@ -69,19 +69,19 @@ class Case:
     @cached_property
     def levels(self) -> dict[str, NDArray[np.int64]]:
         """Histogram of levels in each channel of all stored frames, (3, 256), by view."""
-        return {view: _levels(map(decode, files)) for view, files in self.made.frames.items()}
+        return {view: _levels(map(decode, files)) for view, files in self.episode.frames.items()}
 
     @cached_property
     def sampled_levels(self) -> dict[str, NDArray[np.int64]]:
         """Histogram of levels in each channel of the sampled frames, (3, 256), by view."""
-        return {view: _levels(shown_view.frames.values()) for view, shown_view in self.stored.items()}
+        return {view: _levels(shown_view.frames.values()) for view, shown_view in self.sampled_views.items()}
 
     @cached_property
-    def stored(self) -> dict[str, ShownView]:
+    def sampled_views(self) -> dict[str, ShownView]:
         """Sampled frames of the store, by view."""
-        steps = sampled(len(self.made))
+        steps = sampled(len(self.episode))
         views = {}
-        for view, files in self.made.frames.items():
+        for view, files in self.episode.frames.items():
             frames = {step: decode(files[step]) for step in steps}
             views[view] = ShownView("frames", view, frames)
         return views
@@ -90,7 +90,7 @@ class Case:
     def sampled_depth_m(self) -> dict[tuple[str, int], NDArray[np.float64]]:
         """Stored depth (H, W) in m of the sampled steps, by view and step; empty where no depth is stored."""
         depth_m = {}
-        for view, geometry in self.made.geometry.items():
+        for view, geometry in self.episode.geometry.items():
             files = geometry.maps.get("depth", ())
             for step in sampled(len(files)) if files else ():
                 depth_m[view, step] = decode_exactly(files[step]) * SCHEMA.depth.unit_m
@@ -98,17 +98,17 @@ class Case:
 
     def depth_m(self, view: str) -> NDArray[np.float64]:
         """Return the stored depth of all steps of a view in m, (T, H, W)."""
-        files = self.made.geometry[view].maps["depth"]
+        files = self.episode.geometry[view].maps["depth"]
         return np.stack([decode_exactly(file) for file in files]) * SCHEMA.depth.unit_m
 
     @cached_property
     def shown_views(self) -> list[ShownView]:
         """Views of the store, and views of the copies whose files differ from the store's."""
-        views = [*self.stored.values()]
-        for copy in self.whole:
-            for view, stored in self.stored.items():
+        views = [*self.sampled_views.values()]
+        for copy in self.comparable_copies:
+            for view, stored in self.sampled_views.items():
                 files = copy.episode.frames.get(view)
-                if files and all(files[step] == self.made.frames[view][step] for step in stored.frames):
+                if files and all(files[step] == self.episode.frames[view][step] for step in stored.frames):
                     continue
                 # ``jpeg`` reports files that cannot be decoded, and ``format`` reports missing views.
                 with suppress(ValueError, TypeError, LookupError, cv2.error):
@@ -117,16 +117,16 @@ class Case:
         return views
 
     @cached_property
-    def whole(self) -> list[Copy]:
+    def comparable_copies(self) -> list[Copy]:
         """Copies with the right shapes. A copy with a wrong shape would fail most checks for that reason alone."""
-        return [copy for copy in self.copies if _same_shapes(copy.episode, self.made)]
+        return [copy for copy in self.copies if _same_shapes(copy.episode, self.episode)]
 
     def finding(self, dataset: str, what: str, expected: object) -> Fault:
-        return Fault(dataset, self.made.episode_id, what, str(expected))
+        return Fault(dataset, self.episode.episode_id, what, str(expected))
 
 
-def _same_shapes(copy: Episode, made: Episode) -> bool:
-    return all(getattr(copy, name).shape == getattr(made, name).shape for name in MOTION)
+def _same_shapes(copy: Episode, stored: Episode) -> bool:
+    return all(getattr(copy, name).shape == getattr(stored, name).shape for name in MOTION)
 
 
 def _levels(frames: Iterable[Frame]) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from pipeline import gl
 from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.rlds import Rlds, RldsConfig
 from pipeline.formats.tfrecord import METADATA, columns, info_of, record_at
@@ -96,12 +96,12 @@ def _record(shard: Path, index: int) -> _Record:
     return data, columns(data, info_of(shard.parent).features)
 
 
-def _plan_row(row: Row) -> plan.Row:
+def _plan_row(row: ManifestRow) -> plan.Row:
     return plan.Row(**{column.name: row[column.name] for column in fields(plan.Row)})
 
 
 def _rebuild(
-    row: Row, twin: Row, settings: manifest.Settings, out: Path, root: Path | None
+    row: ManifestRow, twin: ManifestRow, settings: manifest.Settings, out: Path, root: Path | None
 ) -> tuple[_Record | None, str]:
     """Generate the episode again below ``out``; return `None` and the reason if it is not kept this time."""
     if (settings.source == "hdf5") != (root is not None):

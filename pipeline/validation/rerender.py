@@ -1,7 +1,7 @@
 """Comparison of stored frames with new renderings of some episodes, to find wrong or wrongly rotated frames.
 
-A new process renders the frames again, from the trajectory's states. Noise and
-rotation are applied by code of this module, not by the run's (``rendering/render.py``).
+The frames are rendered again from the trajectory's states. Noise and rotation are applied by code of this module, not
+by the run's (``rendering/render.py``).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ BEFORE = 5
 """Steps by which a delayed frame is assumed to be late; in fewer steps, little moves."""
 
 
-def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def choose_rerendered(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Choose a clean episode of every task, and one episode of every axis and combination."""
     chosen: dict[object, str] = {}
     for row in rows:
@@ -45,12 +45,12 @@ def compare_frames(case: Case, render_config: RenderConfig, opened: LastScene) -
     fresh rendering must be the nearest of all pictures that could have been stored by mistake.
     """
     exact = case.row["gl_device"] == gl.choose().device
-    for step in dict.fromkeys((0, len(case.made) // 2)):
+    for step in dict.fromkeys((0, len(case.episode) // 2)):
         fresh = _raw(case, opened, render_config, step)
         former = _raw(case, opened, render_config, step - BEFORE) if step > BEFORE else {}
         for view in fresh:
             name = f"{view} of step {step}"
-            stored = case.made.frames[view][step]
+            stored = case.episode.frames[view][step]
             again = encode(_turned(fresh[view]), render_config.jpeg_quality)
             same = exact and stored == again
             for shown_view in case.shown_views:
@@ -70,8 +70,8 @@ def compare_frames(case: Case, render_config: RenderConfig, opened: LastScene) -
 def compare_subtasks(case: Case) -> Iterator[Fault]:
     """Compute the subtasks again from the states of the replay alone, and compare them with the stored ones."""
     expected = subtasks(case.trajectory, case.task)
-    if tuple(case.made.subtasks) != expected:
-        yield case.finding("frames", f"subtasks {list(case.made.subtasks)}", list(expected))
+    if tuple(case.episode.subtasks) != expected:
+        yield case.finding("frames", f"subtasks {list(case.episode.subtasks)}", list(expected))
 
 
 def _nearest(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from operator import call
 from pathlib import Path
@@ -20,10 +20,9 @@ from pipeline.compute.pool import Workers
 from pipeline.errors import PipelineError
 from pipeline.export_config import FAILURES
 from pipeline.files import read_json, scratch
-from pipeline.formats import registry
-from pipeline.formats.base import Format, Row
+from pipeline.formats import registry, rlds_layout
+from pipeline.formats.base import Format, ManifestRow
 from pipeline.formats.read_back import Fault, Written
-from pipeline.formats.rlds_layout import datasets
 from pipeline.grouping import grouped
 from pipeline.physics.quality import measure
 from pipeline.planning import plan, selection
@@ -39,9 +38,9 @@ from pipeline.stores.frame_store import frames_by_trajectory
 from pipeline.types import Quality
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
-from pipeline.validation.rerender import compare_frames, compare_subtasks, witnesses
+from pipeline.validation.rerender import choose_rerendered, compare_frames, compare_subtasks
 
-WHOLE = 4
+FULLY_DECODED = 4
 """Number of re-rendered episodes of which all frames are decoded, for the statistics of their views."""
 
 SLICE = 16
@@ -91,12 +90,12 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
     total.note("stores", _unlike_stores(run), len(rows))
     with scratch(run.path(WORK) / "validate") as cache:
         try:
-            job = EpisodesJob(run, run.formats, cache, frozenset(witnesses(rows)))
-            total.add(_datasets(job, kept, workers))
+            job = EpisodesJob(run, run.formats, cache, frozenset(choose_rerendered(rows)))
+            total.add(_check_datasets(job, kept, workers))
             failed = _failed_rows(run)
             if failed:
                 job = EpisodesJob(run, run.failure_formats, cache, frozenset([*failed][:1]), of_failures=True)
-                total.add(_datasets(job, failed, workers), within=f"{FAILURES}/")
+                total.add(_check_datasets(job, failed, workers), within=f"{FAILURES}/")
         finally:
             scene_of_process().close()
     report = {}
@@ -105,13 +104,13 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
     return report
 
 
-def _failed_rows(run: Run) -> dict[str, Row]:
+def _failed_rows(run: Run) -> dict[str, ManifestRow]:
     """Map the id of each written failure to its row of the manifest, with its places in the datasets of failures."""
     failures = set(run.outcome.failures) if run.config.export.failures else set()
     if not failures:
         return {}
     places = registry.places(run.failure_formats)
-    failed: dict[str, Row] = {}
+    failed: dict[str, ManifestRow] = {}
     for row in run.manifest:
         episode_id = row["episode_id"]
         if episode_id in failures:
@@ -119,30 +118,30 @@ def _failed_rows(run: Run) -> dict[str, Row]:
     return failed
 
 
-def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
+def _check_datasets(job: EpisodesJob, episodes: Mapping[str, ManifestRow], workers: Workers) -> Results:
     """Check datasets, each as a whole, and their episodes; ``job`` has all datasets."""
     total = Results()
-    files = list(chain.from_iterable(dataset.written() for dataset in job.formats))
+    files = list(chain.from_iterable(dataset.written() for dataset in job.datasets))
     for faults in workers(Written.faults, files, "checksums"):
         total.note("checksums", faults)
     # Datasets with changed files are not checked further, as their content may be anything.
     changed = {fault.dataset for fault in total.findings["checksums"]}
-    unchanged = [dataset for dataset in job.formats if dataset.name not in changed]
+    unchanged = [dataset for dataset in job.datasets if dataset.name not in changed]
     # Workers open the datasets, because they read the episodes with the same packages later.
     open_faults = workers(_find_open_fault, unchanged, "open")
     total.note("readable", [fault for fault in open_faults if fault], 0)
-    job = replace(job, formats=[dataset for dataset, fault in zip(unchanged, open_faults, strict=True) if not fault])
+    job = replace(job, datasets=[dataset for dataset, fault in zip(unchanged, open_faults, strict=True) if not fault])
     # LeRobot, which takes longest, comes before RLDS; the other workers continue with the episodes.
     work: list[Callable[[], Results]] = []
-    for dataset in reversed(job.formats):
-        work.append(partial(_as_a_whole, dataset, episodes, job.cache))
-    if not job.of_failures and any(dataset.name == "rlds" for dataset in job.formats):
+    for dataset in reversed(job.datasets):
+        work.append(partial(_check_dataset, dataset, episodes, job.cache))
+    if not job.of_failures and any(dataset.name == "rlds" for dataset in job.datasets):
         statistics = read_json(job.run.path(STATISTICS))
         work += [
             partial(_openvla_oft, statistics, folder, job.run.config.render.size_px)
-            for folder in datasets(job.run.dataset("rlds").folder)
+            for folder in rlds_layout.datasets(job.run.dataset("rlds").folder)
         ]
-    work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
+    work += [partial(job, rows) for rows in _slices(episodes, job.rerendered, job.datasets)]
     for results in workers(call, work, "validate"):
         total.add(results)
     return total
@@ -221,7 +220,7 @@ def _unlike_stores(run: Run) -> Iterator[Fault]:
         yield from _unlike_row(row, expected)
 
 
-def _planned_rows(run: Run) -> Iterator[tuple[plan.Row, Row]]:
+def _planned_rows(run: Run) -> Iterator[tuple[plan.Row, ManifestRow]]:
     """Yield each row of the plan with its row of the manifest; ``_counts`` reports missing rows."""
     row_of = {row["episode_id"]: row for row in run.manifest}
     for planned in run.plan:
@@ -229,13 +228,14 @@ def _planned_rows(run: Run) -> Iterator[tuple[plan.Row, Row]]:
             yield planned, row_of[planned.episode_id]
 
 
-def _unlike_row(row: Row, expected: Mapping[str, Any]) -> Iterator[Fault]:
+def _unlike_row(row: ManifestRow, expected: Mapping[str, Any]) -> Iterator[Fault]:
     for column, value in expected.items():
         if row[column] != value:
             yield Fault("manifest", row["episode_id"], f"{column} is {row[column]!r}", repr(value))
 
 
-def _as_a_whole(dataset: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:
+def _check_dataset(dataset: Format[Any], episodes: Mapping[str, ManifestRow], cache: Path) -> Results:
+    """Check a dataset as a whole."""
     results, faults = Results(), []
     try:
         # A loop, because faults that precede an error count.
@@ -259,17 +259,19 @@ def _openvla_oft(statistics: Mapping[str, Any], folder: Path, size_px: int) -> R
     return results
 
 
-def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[Format[Any]]) -> list[list[Row]]:
+def _slices(
+    kept: Mapping[str, ManifestRow], rerendered: Collection[str], datasets: Sequence[Format[Any]]
+) -> list[list[ManifestRow]]:
     """Group all episodes into slices, each of which is checked in one call.
 
     Episodes to render again are grouped by trajectory, in the order of tasks, because they share a scene. The other
     episodes follow in the order of the datasets.
     """
     rows = sorted(kept.values(), key=lambda row: (row["suite"], row["task"]))
-    by_trajectory = grouped((row["trajectory_id"], row) for row in rows if row["episode_id"] in again)
-    others = [row for row in rows if row["episode_id"] not in again]
+    by_trajectory = grouped((row["trajectory_id"], row) for row in rows if row["episode_id"] in rerendered)
+    others = [row for row in rows if row["episode_id"] not in rerendered]
     # LeRobot's files are the largest, so they decide first: the next episode is in a file that is open already.
-    columns = list(chain.from_iterable(dataset.columns for dataset in reversed(formats)))
+    columns = list(chain.from_iterable(dataset.columns for dataset in reversed(datasets)))
     others.sort(key=lambda row: [(row[column.name] is None, row[column.name]) for column in columns])
     return [*by_trajectory.values(), *(others[start : start + SLICE] for start in range(0, len(others), SLICE))]
 
@@ -279,19 +281,24 @@ class EpisodesJob:
     """The checks of some episodes, in all places that store them.
 
     Attributes:
-        formats: the datasets that can be opened.
+        datasets: the datasets that can be opened.
         cache: folder for temporary files of the checks of whole datasets.
-        witnesses: ids of the episodes to render again.
+        rerendered: ids of the episodes to render again.
         of_failures: True if the episodes missed their goal.
     """
 
     run: Run
-    formats: Sequence[Format[Any]]
+    datasets: Sequence[Format[Any]]
     cache: Path
-    witnesses: frozenset[str]
+    rerendered: frozenset[str]
     of_failures: bool = False
 
-    def __call__(self, rows: Sequence[Row]) -> Results:
+    @cached_property
+    def fully_decoded(self) -> frozenset[str]:
+        """Ids of the ``FULLY_DECODED`` episodes of which all frames are decoded."""
+        return frozenset(sorted(self.rerendered)[:FULLY_DECODED])
+
+    def __call__(self, rows: Sequence[ManifestRow]) -> Results:
         results, language = Results(), self.run.config.plan.axes.language
         rewrites = {}
         for row in rows:
@@ -303,11 +310,11 @@ class EpisodesJob:
             self._check(row, load, results)
         return results
 
-    def _check(self, row: Row, load: EpisodeLoader, results: Results) -> None:
+    def _check(self, row: ManifestRow, load: EpisodeLoader, results: Results) -> None:
         episode_id = row["episode_id"]
         copies = []
         results.note("readable", [])
-        for dataset in self.formats:
+        for dataset in self.datasets:
             try:
                 copy = dataset.read(row)
             except PipelineError as error:
@@ -320,7 +327,7 @@ class EpisodesJob:
                 missing = Fault(dataset.name, episode_id, "is not in the dataset", "every kept episode")
                 results.note("ids", [missing], 0)
         try:
-            made = load(episode_id)
+            episode = load(episode_id)
             trajectory = self.run.trajectories.load(row["trajectory_id"])
         except PipelineError as error:
             results.note("stored", [Fault("frames", episode_id, str(error), "the output of the run")])
@@ -330,10 +337,16 @@ class EpisodesJob:
             quality = measure(trajectory, task_of(row["suite"], row["task"], row["perturbations"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
         language = self.run.config.plan.axes.language
-        witness = episode_id in sorted(self.witnesses)[:WHOLE]
-        case = Case(row, made, trajectory, copies, language.bank if language else None, witness)
+        case = Case(
+            row=row,
+            episode=episode,
+            trajectory=trajectory,
+            copies=copies,
+            bank=language.bank if language else None,
+            decodes_all_frames=episode_id in self.fully_decoded,
+        )
         for name, check in CHECKS.items():
             results.note(name, check.find(case), int(check.applies(case)))
-        if episode_id in self.witnesses:
+        if episode_id in self.rerendered:
             results.note("rendered", compare_frames(case, self.run.config.render, scene_of_process()))
             results.note("subtasks", compare_subtasks(case))

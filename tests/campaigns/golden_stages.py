@@ -113,6 +113,7 @@ def checks() -> dict[str, Any]:
     marks = {"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz}
     stated = {name: row[name] for name in SCHEMA.provenance}
     stored = replace(made, instruction="task_1", provenance=stated, replay=None)
+    rewrite = {"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1", "camera": None}
     whole = Copy("whole", stored, ["task_1"] * steps, decoded, marks, {"place": 1})
     wrong = Copy(
         dataset="wrong",
@@ -125,9 +126,9 @@ def checks() -> dict[str, Any]:
         ),
         instructions=["something else"] * steps,
         decoded={**decoded, **swapped},
-        marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
+        step_marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
         place={"place": 2},
-        said=[[{"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1", "camera": None}]] * steps,
+        persistent_language=[[rewrite]] * steps,
         events=[[{"role": "assistant", "style": "trace", "content": "{}", "camera": "image"}]] * steps,
         statistics=Statistics(
             {"state": {name: [0.5] * 8 for name in FIGURES} | {"count": [1]}},

@@ -56,8 +56,8 @@ def sets_in(out: Path) -> Written:
 
 def write_all(out: Path, run: Any = loop) -> Written:
     every = sets_in(out)
-    for target in (every.rlds, every.lerobot, every.images):
-        export(target, episodes(), run)
+    for dataset in (every.rlds, every.lerobot, every.images):
+        export(dataset, episodes(), run)
     return every
 
 
@@ -91,8 +91,8 @@ def spread(
     return list(executor.map(fn, items))
 
 
-def lerobot_index(target: LeRobot) -> dict[str, int]:
-    return {episode_id: place["lerobot_episode_index"] for episode_id, place in target.record().places.items()}
+def lerobot_index(dataset: LeRobot) -> dict[str, int]:
+    return {episode_id: place["lerobot_episode_index"] for episode_id, place in dataset.record().places.items()}
 
 
 def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:

@@ -56,9 +56,9 @@ def half_a_code_m(distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
 def write(out: Path, frames: str = "video") -> LeRobot:
     # Rejected when a configuration is read where lerobot is older; the writer asks nothing of lerobot.
     options = LeRobotConfig(name=NAME, shards=3).model_copy(update={"depth": "video", "frames": frames})
-    target = LeRobot(out, options, CONTENT)
-    export(target, episodes(with_maps), loop)
-    return target
+    dataset = LeRobot(out, options, CONTENT)
+    export(dataset, episodes(with_maps), loop)
+    return dataset
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +143,9 @@ def copied(dataset: LeRobot, episode_id: str) -> Copy:
     return copy
 
 
-def findings(check: str, made: Episode, copy: Copy, witness: bool = True) -> list[str]:
+def findings(check: str, made: Episode, copy: Copy, decodes_all_frames: bool = True) -> list[str]:
     no_replay: Any = None
-    case = Case({"instruction": made.instruction}, made, no_replay, [copy], None, witness)
+    case = Case({"instruction": made.instruction}, made, no_replay, [copy], None, decodes_all_frames)
     assert CHECKS[check].applies(case)
     return [fault.what for fault in CHECKS[check].find(case)]
 
@@ -155,8 +155,8 @@ def test_the_reader_finds_no_fault(dataset: LeRobot, episode_id: str) -> None:
     made, copy = with_maps(episode_id), copied(dataset, episode_id)
     assert {view for view, _ in copy.depth_m} == {*COLUMNS}
     for check in ("depth", "geometry", "statistics"):
-        for witness in (True, False):
-            assert findings(check, made, copy, witness) == []
+        for decodes_all_frames in (True, False):
+            assert findings(check, made, copy, decodes_all_frames) == []
 
 
 def test_other_depth_is_found(dataset: LeRobot) -> None:
@@ -285,13 +285,13 @@ else:
 
     @pytest.mark.parametrize("frames", ["video", "images"])
     def test_the_check_by_lerobot_finds_no_fault(tmp_path: Path, frames: str) -> None:
-        target = write(tmp_path / "data", frames)
+        dataset = write(tmp_path / "data", frames)
         kept = {episode_id: {"steps": len(with_maps(episode_id)), "demo_id": "task/demo_0"} for episode_id in IDS}
-        assert [*target.check(kept, tmp_path / "cache")] == []
-        stats = target.root / "meta" / "stats.json"
+        assert [*dataset.check(kept, tmp_path / "cache")] == []
+        stats = dataset.root / "meta" / "stats.json"
         stated = json.loads(stats.read_text())
         be_in_millimetres(stated[COLUMNS["image"]])
         stats.write_text(json.dumps(stated))
-        assert {fault.what.split(" is ")[0] for _, fault in target.check(kept, tmp_path / "cache")} >= {
+        assert {fault.what.split(" is ")[0] for _, fault in dataset.check(kept, tmp_path / "cache")} >= {
             f"mean of {COLUMNS['image']}"
         }

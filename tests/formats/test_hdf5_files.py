@@ -24,7 +24,7 @@ from synthetic import EXTRAS, IDS, NAME, TASK, episode, files, loaded_packages, 
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.hdf5 import Hdf5, Hdf5Config
 from pipeline.run.export import export
@@ -120,8 +120,8 @@ def test_a_quaternion_keeps_the_sign_of_robosuites_axis_angle(tmp_path: Path) ->
         state[:3, 3:6] = axes * angles
         return replace(source, state=state)
 
-    target = write_hdf5(tmp_path, turned)
-    with h5py.File(target.folder / FILE) as file:
+    dataset = write_hdf5(tmp_path, turned)
+    with h5py.File(dataset.folder / FILE) as file:
         np.testing.assert_allclose(file["data/demo_0/robot_states"][:3, 5:], expected, atol=1e-6)
 
 
@@ -147,9 +147,9 @@ def with_boxes(episode_id: str) -> Episode:
 
 
 def test_extras_and_matrices_are_those_of_the_raw_frames(tmp_path: Path) -> None:
-    target = write_hdf5(tmp_path, with_boxes, extras=EXTRAS)
+    dataset = write_hdf5(tmp_path, with_boxes, extras=EXTRAS)
     source = with_boxes(IDS[0])
-    with h5py.File(target.folder / FILE) as file:
+    with h5py.File(dataset.folder / FILE) as file:
         demo = file["data/demo_0"]
         for view, name in (("image", "agentview"), ("wrist_image", "eye_in_hand")):
             geometry = source.geometry[view]
@@ -169,7 +169,7 @@ def test_extras_and_matrices_are_those_of_the_raw_frames(tmp_path: Path) -> None
             np.testing.assert_array_equal(demo.attrs[f"{name}_extrinsics"], geometry.extrinsics)
         np.testing.assert_array_equal(demo["obs/object_poses"], source.object_poses)
         assert json.loads(demo.attrs["instances"]) == list(source.instances)
-    assert faults(target, source=with_boxes) == {}
+    assert faults(dataset, source=with_boxes) == {}
 
 
 def test_rewrites_subtasks_and_a_missed_goal_are_stored(tmp_path: Path) -> None:
@@ -181,8 +181,8 @@ def test_rewrites_subtasks_and_a_missed_goal_are_stored(tmp_path: Path) -> None:
         failed = {**source.provenance, "success": False, "reason": "goal_not_reached"}
         return replace(source, subtasks=subtasks, rewrites=rewrites, provenance=failed)
 
-    target = write_hdf5(tmp_path, labelled, extras=("outcome",))
-    with h5py.File(target.folder / FILE) as file:
+    dataset = write_hdf5(tmp_path, labelled, extras=("outcome",))
+    with h5py.File(dataset.folder / FILE) as file:
         demo = file["data/demo_0"]
         assert demo.attrs["subtask_starts"].tolist() == [0, 4]
         assert demo.attrs["subtask_texts"].tolist() == ["approach the bowl", "öffne"]
@@ -190,7 +190,7 @@ def test_rewrites_subtasks_and_a_missed_goal_are_stored(tmp_path: Path) -> None:
         assert not demo.attrs["success"]
         assert demo["rewards"][()].sum() == 0
         assert demo["dones"][()].sum() == 1
-    copy = target.read({"episode_id": IDS[2]})
+    copy = dataset.read({"episode_id": IDS[2]})
     assert copy is not None
     assert (copy.episode.subtasks, copy.episode.rewrites) == (subtasks, rewrites)
 
@@ -212,12 +212,12 @@ def test_validation_episodes_are_in_files_of_their_own(tmp_path: Path) -> None:
         known[one] = EpisodeFacts(
             "libero_spatial", "content", f"{TASK}/demo_{number // 2}", source.instruction, len(source)
         )
-    target = Hdf5(tmp_path, Hdf5Config(name=NAME, validation=0.34))
-    export(target, Episodes(known, episode), loop)
-    assert sorted(files(target.folder)) == [FILE, f"val/{FILE}"]
+    dataset = Hdf5(tmp_path, Hdf5Config(name=NAME, validation=0.34))
+    export(dataset, Episodes(known, episode), loop)
+    assert sorted(files(dataset.folder)) == [FILE, f"val/{FILE}"]
     rows = {one: {**row(one), "demo_id": facts.demo, "demo_origin_sha256": facts.demo} for one, facts in known.items()}
-    assert list(target.check(rows, tmp_path)) == []
-    copies = [target.read(rows[one]) for one in IDS]
+    assert list(dataset.check(rows, tmp_path)) == []
+    copies = [dataset.read(rows[one]) for one in IDS]
     assert sorted(copy.train for copy in copies if copy) == [False, False, True, True, True, True]
 
 
@@ -236,10 +236,10 @@ def test_the_example_of_the_card_names_a_file_of_the_dataset(validation: float, 
         perturbations = json.dumps([goal] if is_goal else [])
         rows.append({"suite": suite, "task": task, "perturbations": perturbations})
         rows[-1] |= {"demo_id": demo, "demo_origin_sha256": ""}
-    target = Hdf5(tmp_path, Hdf5Config(name=NAME, validation=validation))
-    export(target, Episodes(known, episode), loop)
-    (named,) = re.findall(r"/hdf5/(.*hdf5)", target.loading(NAME, "me/one", rows).partition("```python")[2])
-    assert named in files(target.folder)
+    dataset = Hdf5(tmp_path, Hdf5Config(name=NAME, validation=validation))
+    export(dataset, Episodes(known, episode), loop)
+    (named,) = re.findall(r"/hdf5/(.*hdf5)", dataset.loading(NAME, "me/one", rows).partition("```python")[2])
+    assert named in files(dataset.folder)
     assert ("__in__" in named) == is_goal
 
 
@@ -249,14 +249,14 @@ def row(episode_id: str, source: Callable[[str], Episode] = episode) -> dict[str
     return {**stated, "demo_origin_sha256": "origin"}
 
 
-def faults(target: Hdf5, source: Callable[[str], Episode] = episode) -> Mapping[str, Sequence[str]]:
+def faults(dataset: Hdf5, source: Callable[[str], Episode] = episode) -> Mapping[str, Sequence[str]]:
     """Return what is found in the dataset as a whole and in its first episode, by check."""
     rows = {one: row(one, source) for one in IDS}
     found: dict[str, list[str]] = {}
-    for name, fault in target.check({one: {**rows[one], "demo_id": one} for one in IDS}, target.data):
+    for name, fault in dataset.check({one: {**rows[one], "demo_id": one} for one in IDS}, dataset.data):
         found.setdefault(name, []).append(fault.what)
     made = source(IDS[0])
-    copy = target.read(rows[IDS[0]])
+    copy = dataset.read(rows[IDS[0]])
     if copy is None:
         return {**found, "missing": [IDS[0]]}
     replay = made.replay
@@ -375,6 +375,6 @@ def test_a_truncated_or_missing_file_is_named(written: Hdf5) -> None:
 def test_an_attribute_that_is_lost_is_named(attribute: str, words: str, written: Hdf5) -> None:
     with h5py.File(written.folder / FILE, "r+") as file:
         del file["data/demo_0"].attrs[attribute]
-    wanted: Row = row(IDS[0])
+    wanted: ManifestRow = row(IDS[0])
     with pytest.raises(PipelineError, match=rf"(?s)data/demo_0.*{words}"):
         written.read(wanted)

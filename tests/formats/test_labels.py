@@ -33,11 +33,11 @@ from pipeline.validation.checks import CHECKS
 
 @pytest.mark.parametrize("write", [write_rlds, write_lerobot, write_lerobot_v21])
 def test_each_format_returns_the_labels_of_each_episode(write: Callable[[Path], Format[Any]], tmp_path: Path) -> None:
-    target = write(tmp_path)
-    places = target.record().places
+    dataset = write(tmp_path)
+    places = dataset.record().places
     for episode_id in IDS:
         row = {**places.get(episode_id, {}), "episode_id": episode_id, "demo_id": episode_id}
-        copy = target.read(row)
+        copy = dataset.read(row)
         assert copy is not None
         expected = ((), ()) if episode_id == WITHOUT_LABELS else (SUBTASKS, REWRITES)
         assert (tuple(copy.episode.subtasks), tuple(copy.episode.rewrites)) == expected

@@ -57,14 +57,14 @@ def write_told(folder: Path, convention: str) -> Path:
     """Write a set whose last two episodes are of the split ``val``."""
     # Rejected when it is read where lerobot is older; the writer asks nothing of lerobot.
     update = {"language": True, "convention": convention}
-    target = LeRobot(folder, LeRobotConfig(name=NAME, shards=3, validation=0.3).model_copy(update=update))
+    dataset = LeRobot(folder, LeRobotConfig(name=NAME, shards=3, validation=0.3).model_copy(update=update))
     source = episodes(told)
     # Three demonstrations of a task, of two episodes each.
     known = {
         one: of._replace(demo=f"libero_spatial/task/demo_{k // 2}") for k, (one, of) in enumerate(source.facts.items())
     }
-    export(target, replace(source, facts=known), loop)
-    return target.root
+    export(dataset, replace(source, facts=known), loop)
+    return dataset.root
 
 
 @pytest.fixture(scope="module")

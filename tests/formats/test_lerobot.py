@@ -62,16 +62,16 @@ def test_lerobot_reads_and_merges_many_files(tmp_path: Path, frames: str) -> Non
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
         patch.setattr(lerobot_format, "FILE_MB", 0.2)
-        target = write_lerobot(tmp_path, frames=frames)
+        dataset = write_lerobot(tmp_path, frames=frames)
         numbers = [
-            sorted(file.stem for file in (target.root / kind).rglob("file-*"))
+            sorted(file.stem for file in (dataset.root / kind).rglob("file-*"))
             for kind in ("data", "meta/episodes", *(["videos/observation.images.image2"] if frames == "video" else []))
         ]
         assert len(numbers[0]) > 3
         assert all(found == numbers[0] for found in numbers), "files of one number hold the same episodes"
-        assert_lerobot_episodes(target.root, exact=frames == "images")
+        assert_lerobot_episodes(dataset.root, exact=frames == "images")
         # Merging finds the files by what the rows of meta/episodes say.
-        lerobot.datasets.aggregate.aggregate_datasets([REPO], REPO, roots=[target.root], aggr_root=tmp_path / "again")
+        lerobot.datasets.aggregate.aggregate_datasets([REPO], REPO, roots=[dataset.root], aggr_root=tmp_path / "again")
         assert_lerobot_episodes(tmp_path / "again", exact=frames == "images")
 
 
@@ -79,8 +79,8 @@ def test_lerobot_reads_and_merges_many_files(tmp_path: Path, frames: str) -> Non
 def test_a_video_file_has_almost_the_stated_size(views: tuple[str, ...], tmp_path: Path) -> None:
     """Each view has its own file, so the number of views does not change the steps of a file."""
     known = {f"episode-{k}": EpisodeFacts("libero_spatial", demo=f"task/demo_{k}", steps=100) for k in range(3000)}
-    target = lerobot_format.LeRobot(tmp_path, lerobot_format.LeRobotConfig(name=REPO), Content(views=views))
-    pieces = target.pieces(Episodes(known, episode))
+    dataset = lerobot_format.LeRobot(tmp_path, lerobot_format.LeRobotConfig(name=REPO), Content(views=views))
+    pieces = dataset.pieces(Episodes(known, episode))
     measured_kb = 6.7  # The mean frame of ``benchmarks/video_quality.py``.
     sizes_mb = [piece.steps * measured_kb / 1000 for piece in pieces]
     assert len(pieces) == 12
@@ -88,8 +88,8 @@ def test_a_video_file_has_almost_the_stated_size(views: tuple[str, ...], tmp_pat
 
 
 def test_lerobot_provenance_has_a_row_for_each_episode(written: Written) -> None:
-    for target in (written.lerobot, written.images):
-        rows = pq.read_table(target.root / "meta" / "provenance.parquet").to_pylist()
+    for dataset in (written.lerobot, written.images):
+        rows = pq.read_table(dataset.root / "meta" / "provenance.parquet").to_pylist()
         assert [{name: row[name] for name in ("episode_index", *SCHEMA.provenance)} for row in rows] == [
             {"episode_index": k, **episode(episode_id).provenance} for k, episode_id in enumerate(IDS)
         ]
@@ -125,11 +125,11 @@ def test_lerobot_statistics_are_exact(written: Written) -> None:
     assert_statistics(stats["observation.images.image"], np.concatenate(frames), (0, 1, 2))
     assert stats["observation.images.image"]["mean"].shape == (3, 1, 1)
     assert set(stats) >= {"observation.state", "observation.joint_state", "observation.images.image2", "timestamp"}
-    for target in (written.lerobot, written.images):
-        assert json.loads((target.root / "meta" / "stats.json").read_text()) == json.loads(
+    for dataset in (written.lerobot, written.images):
+        assert json.loads((dataset.root / "meta" / "stats.json").read_text()) == json.loads(
             (written.lerobot.root / "meta" / "stats.json").read_text()
         )
-        for row, shown in zip(pq.read_table(target.root / "meta" / "episodes").to_pylist(), frames, strict=True):
+        for row, shown in zip(pq.read_table(dataset.root / "meta" / "episodes").to_pylist(), frames, strict=True):
             of_episode = {name.rpartition("/")[2]: value for name, value in row.items() if "image/" in name}
             assert_statistics(of_episode, shown, (0, 1, 2))
 

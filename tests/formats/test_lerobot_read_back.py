@@ -46,13 +46,13 @@ def put(file: Path, column: str, value: Any) -> None:
 
 @pytest.mark.parametrize("version", WITH_IMAGES)
 def test_every_image_file_is_read_back(version: str, tmp_path: Path) -> None:
-    target, source = WITH_IMAGES[version](tmp_path), episode(IDS[-1])
-    copy = target.read(source.provenance)
+    dataset, source = WITH_IMAGES[version](tmp_path), episode(IDS[-1])
+    copy = dataset.read(source.provenance)
     assert copy is not None
     assert copy.episode.frames == source.frames
     other = {"bytes": source.frames["wrist_image"][0], "path": None}
-    put(max(target.folder.glob("*/data/**/*.parquet")), target.keys["wrist_image"], other)
-    copy = target.read(source.provenance)
+    put(max(dataset.folder.glob("*/data/**/*.parquet")), dataset.keys["wrist_image"], other)
+    copy = dataset.read(source.provenance)
     assert copy is not None
     (fault,) = CHECKS["jpeg"].find(Case({}, source, replay_of(source), [copy], None))
     assert fault.what == f"wrist_image differs at 1 steps, first at {len(source) - 1}"
@@ -67,30 +67,32 @@ def stored_otherwise(text: str) -> str:
     return json.dumps(found)
 
 
-def of_first(target: LeRobot | LeRobotV21) -> list[Fault]:
+def of_first(dataset: LeRobot | LeRobotV21) -> list[Fault]:
     """What is found in the statistics of the first episode, as ``validate`` finds it."""
     source = episode(IDS[0])
-    copy = target.read(source.provenance)
+    copy = dataset.read(source.provenance)
     assert copy is not None
     return list(CHECKS["statistics"].find(Case({}, source, replay_of(source), [copy], None)))
 
 
 @pytest.mark.parametrize("version", WITH_IMAGES)
 def test_ids_and_numbers_of_steps_and_statistics_are_read(version: str, tmp_path: Path) -> None:
-    target = WITH_IMAGES[version](tmp_path)
+    dataset = WITH_IMAGES[version](tmp_path)
     kept = {one: {**episode(one).provenance, "steps": len(episode(one))} for one in IDS}
-    assert list(target.check(kept, tmp_path)) == []
-    for file in target.folder.glob("*/meta/*stats.json*"):
+    assert list(dataset.check(kept, tmp_path)) == []
+    for file in dataset.folder.glob("*/meta/*stats.json*"):
         first, *others = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
         file.write_text("\n".join([stored_otherwise(first), *others]))
-        (fault,) = (fault for _, fault in target.check(kept, tmp_path)) if file.suffix == ".json" else of_first(target)
-        assert f"mean of {target.keys['action']} is" in fault.what
+        (fault,) = (
+            (fault for _, fault in dataset.check(kept, tmp_path)) if file.suffix == ".json" else of_first(dataset)
+        )
+        assert f"mean of {dataset.keys['action']} is" in fault.what
         file.write_text("\n".join([first, *others]))
-    data = max(target.folder.glob("*/data/**/*.parquet"))
+    data = max(dataset.folder.glob("*/data/**/*.parquet"))
     whole = data.read_bytes()
     for column, value in (("episode_id", IDS[0]), ("index", 0), ("episode_index", 0)):
         put(data, column, value)
         with pytest.raises(PipelineError, match=f"by {column}, these are not the {len(episode(IDS[-1]))} steps"):
-            target.read(kept[IDS[-1]])
+            dataset.read(kept[IDS[-1]])
         data.write_bytes(whole)
-    assert target.read(kept[IDS[-1]]) is not None
+    assert dataset.read(kept[IDS[-1]]) is not None

@@ -130,15 +130,15 @@ def test_rlds_holds_the_episodes(written: Written) -> None:
 
 
 def test_a_set_with_an_episode_too_many_or_a_foreign_shard_is_found(tmp_path: Path) -> None:
-    target = write_rlds(tmp_path)
-    places = {name: {**place, "demo_id": name} for name, place in target.record().places.items()}
-    assert list(target.check(places, tmp_path)) == []
-    ((check, fault),) = target.check({one: places[one] for one in IDS[1:]}, tmp_path)
+    dataset = write_rlds(tmp_path)
+    places = {name: {**place, "demo_id": name} for name, place in dataset.record().places.items()}
+    assert list(dataset.check(places, tmp_path)) == []
+    ((check, fault),) = dataset.check({one: places[one] for one in IDS[1:]}, tmp_path)
     assert (check, fault.what) == ("ids", "has 6 episodes, of which some are foreign or repeated")
-    (shard, *_) = sorted(target.folder.rglob("*.tfrecord-*"))
+    (shard, *_) = sorted(dataset.folder.rglob("*.tfrecord-*"))
     shutil.copy(shard, shard.with_name(f"{SET}-train.tfrecord-00003-of-00003"))
     assert ("format", True) in [
-        (check, "00003-of-00003" in fault.what) for check, fault in target.check(places, tmp_path)
+        (check, "00003-of-00003" in fault.what) for check, fault in dataset.check(places, tmp_path)
     ]
 
 

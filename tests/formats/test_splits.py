@@ -150,9 +150,9 @@ def episode_ids(dataset: LeRobotDataset) -> list[str]:
 @pytest.fixture(scope="module")
 def held_out(episodes: Episodes, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root of a LeRobot dataset with a validation split."""
-    target = LeRobot(tmp_path_factory.mktemp("held_out"), LeRobotConfig(name=NAME, shards=3, validation=0.34))
-    export(target, episodes, loop)
-    return target.root
+    dataset = LeRobot(tmp_path_factory.mktemp("held_out"), LeRobotConfig(name=NAME, shards=3, validation=0.34))
+    export(dataset, episodes, loop)
+    return dataset.root
 
 
 @pytest.mark.slow

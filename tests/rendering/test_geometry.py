@@ -261,7 +261,7 @@ def cases(data: Path) -> list[Case]:
     return [
         Case(
             row=row,
-            made=load(episode_id),
+            episode=load(episode_id),
             trajectory=TrajectoryStore(data / "trajectories").load(row["trajectory_id"]),
             copies=[copy for copy in read[episode_id] if copy is not None],
             bank=None,
@@ -273,7 +273,7 @@ def cases(data: Path) -> list[Case]:
 def test_both_datasets_have_what_the_store_has(run: Path) -> None:
     found = cases(run)
     assert sorted(str(case.row["axis"]) for case in found) == ["camera", "clean", "layout"]
-    names = {str(case.row["axis"]): tuple(case.made.instances) for case in found}
+    names = {str(case.row["axis"]): tuple(case.episode.instances) for case in found}
     assert names["clean"] == names["camera"] == (*COMMON, *bddl.read(BOWL.bddl_file).things)
     assert names["layout"][: len(names["clean"])] == names["clean"], "an id means the same in all episodes of a task"
     assert len(names["layout"]) == len(names["clean"]) + 2
@@ -282,11 +282,11 @@ def test_both_datasets_have_what_the_store_has(run: Path) -> None:
         assert list(CHECKS["geometry"].find(case)) == []
         assert list(CHECKS["boxes"].find(case)) == []
         assert CHECKS["boxes"].applies(case)
-        last = pixels(case.made.geometry["image"].maps["segmentation"][-1])
-        shown = {case.made.instances[place] for place in np.unique(last).tolist()}
+        last = pixels(case.episode.geometry["image"].maps["segmentation"][-1])
+        shown = {case.episode.instances[place] for place in np.unique(last).tolist()}
         assert {"robot", "gripper", "table", "wall", "plate_1", "wooden_cabinet_1"} <= shown
     moved, clean = (
-        next(case.made.geometry for case in found if case.row["axis"] == axis) for axis in ("camera", "clean")
+        next(case.episode.geometry for case in found if case.row["axis"] == axis) for axis in ("camera", "clean")
     )
     assert not np.array_equal(moved["image"].extrinsics, clean["image"].extrinsics)
     assert moved["wrist_image"].maps == clean["wrist_image"].maps
@@ -296,11 +296,11 @@ def test_the_traces_go_through_the_pixels_of_the_gripper(run: Path) -> None:
     """By the boxes around its mask, which the renderer's ids give."""
     compared = 0
     for case in cases(run):
-        boxes = case.made.geometry["image"].boxes
+        boxes = case.episode.geometry["image"].boxes
         assert boxes is not None
-        for note in event_annotations(case.made, 256):
+        for note in event_annotations(case.episode, 256):
             for k, (x, y) in enumerate(json.loads(note.text)["points"]):
-                left, top, width, height = boxes[note.step + k * TRACE_STEPS, case.made.instances.index("gripper")]
+                left, top, width, height = boxes[note.step + k * TRACE_STEPS, case.episode.instances.index("gripper")]
                 assert (left <= x < left + width, top <= y < top + height) == (True, True)
                 compared += 1
     assert compared > 5
@@ -328,13 +328,13 @@ def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:
 @pytest.mark.parametrize("view", ["image", "wrist_image"])
 def test_a_box_that_is_not_around_its_mask_is_a_finding(view: str, run: Path) -> None:
     case = cases(run)[0]
-    seen = case.made.geometry[view]
+    seen = case.episode.geometry[view]
     assert seen.boxes is not None
     shifted = seen.boxes.copy()
-    place = case.made.instances.index("gripper")
+    place = case.episode.instances.index("gripper")
     shifted[0, place, 0] += 1
-    spoilt = replace(case.made, geometry={**case.made.geometry, view: replace(seen, boxes=shifted)})
-    (finding,) = CHECKS["boxes"].find(replace(case, made=spoilt))
+    spoilt = replace(case.episode, geometry={**case.episode.geometry, view: replace(seen, boxes=shifted)})
+    (finding,) = CHECKS["boxes"].find(replace(case, episode=spoilt))
     assert finding.what.startswith(f"{view}_boxes of step 0 has ")
     assert finding.what.endswith(f"at place {place}")
 

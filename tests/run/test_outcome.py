@@ -61,7 +61,7 @@ def test_rendered_episodes_alone_have_labels_and_a_name_of_their_actions(run: Ou
         actions = "its actions" if row["steps"] == 90 else None
         assert row["actions_sha256"] == actions
         expected = {**rendered, "rewrites": [f"do {row['axis']}"]} if actions else None
-        assert manifest.labels_of(row) == expected
+        assert manifest.read_labels(row) == expected
 
 
 def test_each_row_has_what_its_own_trajectory_and_frames_came_to(run: Outcome) -> None:

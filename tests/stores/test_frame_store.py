@@ -106,10 +106,10 @@ def test_finished_work_is_generated_again_only_where_that_was_allowed(
     told = {"files of frames": {number: 1}}
     assert found == told | ({"trajectories": {number: 1}} if step == "physics" else {})
     with pytest.raises(PipelineError, match=rf"1 files of frames, generated with {number}(?s:.*)REMAKE=1` before"):
-        identity.reject_unasked(join_kinds(found), tmp_path)
+        identity.require_remake_permission(join_kinds(found), tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
     monkeypatch.setenv(identity.REMAKE, "1")
-    identity.reject_unasked(join_kinds(found), tmp_path)
+    identity.require_remake_permission(join_kinds(found), tmp_path)
     assert number in capsys.readouterr().out
     if step == "pixels":
         monkeypatch.delenv(identity.REMAKE)

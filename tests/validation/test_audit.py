@@ -87,12 +87,12 @@ def datasets(test: TestSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     out = tmp_path_factory.mktemp("planted")
     known = {one: EpisodeFacts("libero_goal", "planted", "", texts[one], len(episode(one))) for one in IDS}
-    for target in (
+    for dataset in (
         Rlds(out, RldsConfig(name=NAME, shards=2)),
         LeRobot(out, LeRobotConfig(name=NAME, shards=1)),
         LeRobotV21(out, LeRobotV21Config(name=NAME, convention="ipec")),
     ):
-        export(target, Episodes(known, load), loop)
+        export(dataset, Episodes(known, load), loop)
     return out
 
 

@@ -59,7 +59,7 @@ def test_frames_of_another_motion_than_the_replays_are_found() -> None:
         (replace(MADE, action_absolute=moved(4)), "action_absolute has other orientations"),
         (replace(MADE, action_absolute=moved(6)), "action_absolute has other gripper commands"),
     ):
-        (fault,) = CHECKS["motion"].find(replace(whole, made=spoilt))
+        (fault,) = CHECKS["motion"].find(replace(whole, episode=spoilt))
         assert (fault.dataset, fault.what) == ("frames", what)
 
 

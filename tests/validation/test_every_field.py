@@ -49,36 +49,38 @@ def opened(name: str, written: Path, folder: Path) -> Format[Any]:
     return Rlds(folder, RldsConfig(name="synthetic", shards=3))
 
 
-def rows(target: Format[Any]) -> dict[str, dict[str, Any]]:
-    places = target.record().places
+def rows(dataset: Format[Any]) -> dict[str, dict[str, Any]]:
+    places = dataset.record().places
     return {one: {**episode(one).provenance, "steps": len(episode(one)), **places.get(one, {})} for one in IDS}
 
 
-def found(target: Format[Any], folder: Path) -> list[str]:
+def found(dataset: Format[Any], folder: Path) -> list[str]:
     """What is off with a dataset as a whole, and with its first episode."""
-    kept, texts = rows(target), []
+    kept, texts = rows(dataset), []
     try:
-        for _, fault in target.check(kept, folder / "cache"):
+        for _, fault in dataset.check(kept, folder / "cache"):
             texts.append(fault.what)
-        texts += [fault.what for fault in of_first(target, kept, folder)]
+        texts += [fault.what for fault in of_first(dataset, kept, folder)]
     except PipelineError as error:
         texts.append(str(error))
     return texts
 
 
-def found_in_first(target: Format[Any], folder: Path) -> list[str]:
+def found_in_first(dataset: Format[Any], folder: Path) -> list[str]:
     """Return the faults of the first episode alone, which is faster."""
     try:
-        return [fault.what for fault in of_first(target, rows(target), folder)]
+        return [fault.what for fault in of_first(dataset, rows(dataset), folder)]
     except PipelineError as error:
         return [str(error)]
 
 
-def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path, witness: bool = True) -> list[Fault]:
+def of_first(
+    dataset: Format[Any], kept: dict[str, dict[str, Any]], folder: Path, decodes_all_frames: bool = True
+) -> list[Fault]:
     source = episode(IDS[0])
-    copy = target.read(kept[IDS[0]])
+    copy = dataset.read(kept[IDS[0]])
     if copy is None:
-        return [Fault(target.name, IDS[0], "is not in the dataset", "every kept episode")]
+        return [Fault(dataset.name, IDS[0], "is not in the dataset", "every kept episode")]
     none = np.zeros((0, 0), np.float32)
     actions = source.action.astype(float)
     states = np.zeros((len(source) + 1, 10))
@@ -86,10 +88,10 @@ def of_first(target: Format[Any], kept: dict[str, dict[str, Any]], folder: Path,
     replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), states, actions, none, Verdict(True, "kept"))
     labels = labels_of(source)
     row = {**kept[IDS[0]], **labels, "rewrites": json.dumps(labels["rewrites"]), "kept": True}
-    case = Case({**row, "instruction": source.instruction}, source, replay, [copy], None, witness)
+    case = Case({**row, "instruction": source.instruction}, source, replay, [copy], None, decodes_all_frames)
     names = ("length", "motion", "instruction", "labels", "provenance", "place", "jpeg", "geometry", "flags", "clock")
     faults = [fault for name in ("statistics", *names) for fault in CHECKS[name].find(case)]
-    return [fault for fault in faults if fault.dataset == target.name]
+    return [fault for fault in faults if fault.dataset == dataset.name]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -154,38 +156,38 @@ def brighter(value: Any) -> Any:
 def test_each_changed_field_of_version_3_is_found(
     file: str, at: Path_, change: Callable[[Any], Any], what: str, written: Path, tmp_path: Path
 ) -> None:
-    target = opened("lerobot", written, tmp_path)
-    spoil(target.root / file, at, change)
-    texts = found(target, tmp_path)
+    dataset = opened("lerobot", written, tmp_path)
+    spoil(dataset.root / file, at, change)
+    texts = found(dataset, tmp_path)
     assert any(text.startswith(what) for text in texts), texts
 
 
 @pytest.mark.parametrize("column", [f"stats/{IMAGE}/std", f"stats/{WRIST}/q50", "stats/action/mean", "stats/index/max"])
 def test_changed_statistics_of_an_episode_of_version_3_are_found(column: str, written: Path, tmp_path: Path) -> None:
-    target = opened("lerobot", written, tmp_path)
-    spoil_table(min((target.root / "meta" / "episodes").rglob("*.parquet")), column, tenth)
+    dataset = opened("lerobot", written, tmp_path)
+    spoil_table(min((dataset.root / "meta" / "episodes").rglob("*.parquet")), column, tenth)
     _, name, figure = column.split("/")
-    texts = [fault.what for fault in of_first(target, rows(target), tmp_path)]
+    texts = [fault.what for fault in of_first(dataset, rows(dataset), tmp_path)]
     assert any(text.startswith(f"{figure} of {name} is") for text in texts)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_changed_deviation_is_found_in_sampled_frames(factor: float, written: Path, tmp_path: Path) -> None:
     """Of most episodes, only three frames are decoded."""
-    target = opened("lerobot", written, tmp_path)
-    assert of_first(target, rows(target), tmp_path, witness=False) == []
-    table = min((target.root / "meta" / "episodes").rglob("*.parquet"))
+    dataset = opened("lerobot", written, tmp_path)
+    assert of_first(dataset, rows(dataset), tmp_path, decodes_all_frames=False) == []
+    table = min((dataset.root / "meta" / "episodes").rglob("*.parquet"))
     spoil_table(table, f"stats/{IMAGE}/std", lambda value: (factor * np.array(value)).tolist())
-    os.utime(target.root / "meta" / "info.json", ns=(1, 1))
-    texts = [fault.what for fault in of_first(target, rows(target), tmp_path, witness=False)]
+    os.utime(dataset.root / "meta" / "info.json", ns=(1, 1))
+    texts = [fault.what for fault in of_first(dataset, rows(dataset), tmp_path, decodes_all_frames=False)]
     assert [text.startswith(f"std of {IMAGE} is") for text in texts] == [True]
 
 
 @pytest.mark.parametrize("column", ["episode_id", "suite", "axis", "component", "level"])
 def test_a_changed_label_by_which_users_select_is_found(column: str, written: Path, tmp_path: Path) -> None:
-    target = opened("lerobot", written, tmp_path)
-    spoil_table(min((target.root / "meta" / "episodes").rglob("*.parquet")), column, another)
-    texts = found(target, tmp_path)
+    dataset = opened("lerobot", written, tmp_path)
+    spoil_table(min((dataset.root / "meta" / "episodes").rglob("*.parquet")), column, another)
+    texts = found(dataset, tmp_path)
     assert any(text.startswith(f"meta/episodes, {IDS[0]}: {column} is") for text in texts), texts
 
 
@@ -195,10 +197,10 @@ def test_a_changed_label_by_which_users_select_is_found(column: str, written: Pa
 def test_changed_image_statistics_of_version_21_are_found(
     figure: str, change: Callable[[Any], Any], file: str, written: Path, tmp_path: Path
 ) -> None:
-    target = opened("lerobot_v21", written, tmp_path)
+    dataset = opened("lerobot_v21", written, tmp_path)
     at = ("stats", IMAGE, figure) if file.endswith("l") else (IMAGE, figure)
-    spoil(target.folder / SET / "meta" / file, at, change)
-    assert any(f"{figure} of {IMAGE} is" in text for text in found(target, tmp_path))
+    spoil(dataset.folder / SET / "meta" / file, at, change)
+    assert any(f"{figure} of {IMAGE} is" in text for text in found(dataset, tmp_path))
 
 
 def leaves(value: Any, at: Path_ = ()) -> Iterator[Path_]:
@@ -236,15 +238,15 @@ def another(value: Any) -> Any:
 )
 def test_every_value_counts(name: str, file: str, written: Path, tmp_path: Path) -> None:
     """Changed one after another, each is found; so is each that is not there."""
-    target = opened(name, written, tmp_path)
-    path = target.folder / NAMES[name] / file
+    dataset = opened(name, written, tmp_path)
+    path = dataset.folder / NAMES[name] / file
     text = path.read_text()
     places = list(leaves(json.loads(text.splitlines()[0] if path.suffix == ".jsonl" else text)))
     assert len(places) > 1
     passed = []
     for place in places:
         spoil(path, place, another)
-        if not found(target, tmp_path):
+        if not found(dataset, tmp_path):
             passed.append(place)
         path.write_text(text)
     assert passed == []
@@ -262,8 +264,8 @@ def test_every_value_counts(name: str, file: str, written: Path, tmp_path: Path)
 )
 def test_every_column_counts(name: str, file: str, written: Path, tmp_path: Path) -> None:
     """Changed at the first episode or step, one after another, each is found."""
-    target = opened(name, written, tmp_path)
-    path = target.folder / NAMES[name] / file
+    dataset = opened(name, written, tmp_path)
+    path = dataset.folder / NAMES[name] / file
     # The version of this project is for information only.
     columns = [column for column in pq.read_schema(path).names if column != OWN_VERSION]
     content = path.read_bytes()
@@ -272,8 +274,8 @@ def test_every_column_counts(name: str, file: str, written: Path, tmp_path: Path
     for number, column in enumerate(columns):
         spoil_table(path, column, another)
         # Readers keep the tables of meta/ until info.json changes.
-        os.utime(target.folder / NAMES[name] / "meta" / "info.json", ns=(number, number))
-        if not (found_in_first(target, tmp_path) or found(target, tmp_path)):
+        os.utime(dataset.folder / NAMES[name] / "meta" / "info.json", ns=(number, number))
+        if not (found_in_first(dataset, tmp_path) or found(dataset, tmp_path)):
             passed.append(column)
         path.write_bytes(content)
     assert passed == []
@@ -281,26 +283,26 @@ def test_every_column_counts(name: str, file: str, written: Path, tmp_path: Path
 
 @pytest.mark.parametrize("name", ["lerobot_v21"])
 def test_a_provenance_of_episodes_in_another_order_is_found(name: str, written: Path, tmp_path: Path) -> None:
-    target = opened(name, written, tmp_path)
-    path = target.folder / NAMES[name] / "meta" / "provenance.parquet"
+    dataset = opened(name, written, tmp_path)
+    path = dataset.folder / NAMES[name] / "meta" / "provenance.parquet"
     table = pq.read_table(path)
     place = table.schema.get_field_index("episode_index")
     reversed_indices = pa.array(table["episode_index"].to_pylist()[::-1], pa.int64())
     pq.write_table(table.set_column(place, table.schema.field(place), reversed_indices), path)
-    assert any("episode_index of provenance.parquet is [5, 4" in text for text in found(target, tmp_path))
+    assert any("episode_index of provenance.parquet is [5, 4" in text for text in found(dataset, tmp_path))
 
 
 def test_a_changed_path_of_the_demonstration_in_rlds_is_found(written: Path, tmp_path: Path) -> None:
-    target = opened("rlds", written, tmp_path)
+    dataset = opened("rlds", written, tmp_path)
     path = f"demo_source of {IDS[0]}"
-    for shard in target.folder.rglob("*.tfrecord-*"):
+    for shard in dataset.folder.rglob("*.tfrecord-*"):
         changed_records = []
         for record in records(shard):
             before, name, after = record.partition(b"episode_metadata/file_path")
             # The same value is also stored as demo_source.
             changed_records.append(before + name + after.replace(path.encode(), b"x" * len(path), 1))
         shard.write_bytes(b"".join(map(framed, changed_records)))
-    assert found(target, tmp_path) == [f"file_path is '{'x' * len(path)}'"]
+    assert found(dataset, tmp_path) == [f"file_path is '{'x' * len(path)}'"]
 
 
 @pytest.mark.parametrize("name", ["lerobot", "rlds"])
@@ -313,18 +315,18 @@ def test_a_demonstration_in_both_splits_is_found(name: str, tmp_path: Path) -> N
 
     made = episodes()
     known = {one: of._replace(demo=f"libero_spatial/bowl/demo_{k}") for k, (one, of) in enumerate(made.facts.items())}
-    target: Format[Any] = (
+    dataset: Format[Any] = (
         LeRobot(tmp_path, LeRobotConfig(name="synthetic", shards=3, validation=0.4))
         if name == "lerobot"
         else Rlds(tmp_path, RldsConfig(name="synthetic", shards=3, validation=0.4))
     )
-    export(target, Episodes(known, made.load), loop)
-    kept = rows(target)
+    export(dataset, Episodes(known, made.load), loop)
+    kept = rows(dataset)
     for one, row in kept.items():
         row["demo_id"] = known[one].demo
-    assert [fault.what for _, fault in target.check(kept, tmp_path)] == []
+    assert [fault.what for _, fault in dataset.check(kept, tmp_path)] == []
     for label in ("demo_id", "demo_origin_sha256"):
         same = {one: {**row, label: "libero_spatial/bowl/one"} for one, row in kept.items()}
-        faults = [(check, fault.what) for check, fault in target.check(same, tmp_path)]
+        faults = [(check, fault.what) for check, fault in dataset.check(same, tmp_path)]
         assert faults
         assert all(check == "splits" and "of the same demonstration" in what for check, what in faults)

@@ -33,7 +33,7 @@ from pipeline.run.run import Run
 from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
-from pipeline.validation.rerender import witnesses
+from pipeline.validation.rerender import choose_rerendered
 from pipeline.validation.validate import validate
 
 Tree = dict[str, Any]
@@ -297,7 +297,7 @@ def test_planted_faults_stop_the_run_and_nothing_else_is_found(
         for check, result in report.items()
         for finding in result["findings"]
     }
-    again = {names[episode_id] for episode_id in witnesses(rows)}
+    again = {names[episode_id] for episode_id in choose_rerendered(rows)}
     assert ("clean", BOWL) in again
     assert found == EXPECTED | {("rendered", dataset, name) for name, dataset in OTHER_FRAMES.items() if name in again}
     assert not (data / ".work").exists()
@@ -318,7 +318,7 @@ def test_what_is_missing_or_cannot_be_read_is_a_finding(
     rotten = min((data / "frames" / rows[0]["trajectory_id"]).iterdir())
     rot(rotten)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])  # Tested above, and slow.
+    monkeypatch.setattr("pipeline.validation.validate.choose_rerendered", lambda rows: [])  # Tested above, and slow.
     report = validate(Run(load(finished.parent.parent / "configs" / "tiny.yaml")), loop)
     told = sorted((finding["dataset"], finding["what"]) for finding in report["readable"]["findings"])
     assert [dataset for dataset, _ in told] == ["lerobot", "rlds", "rlds"]

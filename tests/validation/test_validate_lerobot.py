@@ -43,8 +43,8 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         config = with_v21(finished)
         options = config.export.options_for(LeRobotV21)
         assert options is not None
-        target = LeRobotV21(config.run_folder, options)
-        export(target, episodes_of(target, Run(config)), loop)
+        dataset = LeRobotV21(config.run_folder, options)
+        export(dataset, episodes_of(dataset, Run(config)), loop)
     return folder
 
 
@@ -59,10 +59,10 @@ def checked(version: str, config: Config) -> dict[str, list[Fault]]:
     run = Run(config).resolved()
     data = run.folder
     kept = {row["episode_id"]: row for row in manifest.read(data / "manifest.parquet") if row["kept"]}
-    (target,) = (one for one in config.export.datasets(data) if one.name == version)
-    results = EpisodesJob(run, [target], data, frozenset())(list(kept.values()))
+    (dataset,) = (one for one in config.export.datasets(data) if one.name == version)
+    results = EpisodesJob(run, [dataset], data, frozenset())(list(kept.values()))
     with suppress(PipelineError):  # An episode says it too.
-        for check, fault in target.check(kept, data / "cache"):
+        for check, fault in dataset.check(kept, data / "cache"):
             results.note(check, [fault])
     return {check: faults for check, faults in results.findings.items() if faults}
 
@@ -197,12 +197,12 @@ def test_language_columns_are_held_against_what_was_to_be_written(
     told = options.model_copy(update={"language": True})
     config = config.model_copy(update={"export": config.export.model_copy(update={"lerobot": told})})
     monkeypatch.chdir(tmp_path)
-    target = LeRobot(config.run_folder, told)
-    export(target, episodes_of(target, Run(config)), loop)
-    job = EpisodesJob(Run(config), [target], config.run_folder, frozenset())
+    dataset = LeRobot(config.run_folder, told)
+    export(dataset, episodes_of(dataset, Run(config)), loop)
+    job = EpisodesJob(Run(config), [dataset], config.run_folder, frozenset())
     rows = [row for row in manifest.read(config.run_folder / "manifest.parquet") if row["kept"]]
     assert not any(job(rows).findings.values())
-    file = min(target.root.glob("data/*/*"))
+    file = min(dataset.root.glob("data/*/*"))
     table = pq.read_table(file)
     place, field = table.schema.get_field_index("language_persistent"), table.schema.field("language_persistent")
     # All say what the last step does.

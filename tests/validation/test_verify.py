@@ -120,7 +120,7 @@ def test_a_changed_dataset_is_not_read_any_further(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = tmp_path / "data" / "tiny"
-    monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])
+    monkeypatch.setattr("pipeline.validation.validate.choose_rerendered", lambda rows: [])
     shutil.copytree(finished, data)
     for name in ("rlds", "lerobot"):
         rot(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))

@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from pipeline.axes import task_of
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content
-from pipeline.formats.base import CardFacts, Format, FormatOptions, Name, Row, StepSizes, ValidationShare
+from pipeline.formats.base import CardFacts, Format, FormatOptions, ManifestRow, Name, StepSizes, ValidationShare
 from pipeline.formats.episodes import EpisodeFacts, Episodes, Load, Piece, demos_for_validation
 from pipeline.formats.hdf5 import layout
 from pipeline.formats.read_back import Copy, Fault
@@ -87,17 +87,17 @@ class Hdf5(Format[Hdf5Config]):
 
         read.open_all(self.folder)
 
-    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+    def check(self, kept: Mapping[str, ManifestRow], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats.hdf5 import read
 
         return read.check(self.folder, kept, self.content, self.options.validation)
 
-    def read(self, row: Row) -> Copy | None:
+    def read(self, row: ManifestRow) -> Copy | None:
         from pipeline.formats.hdf5 import read
 
         return read.read(self.folder, row["episode_id"], self.content)
 
-    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+    def loading(self, name: str, repository: str, kept: Sequence[ManifestRow]) -> str:
         facts: list[EpisodeFacts] = []
         for row in kept:
             task = task_of(row["suite"], row["task"], row["perturbations"])

@@ -14,10 +14,19 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import SCHEMA, Content
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.hdf5 import layout
 from pipeline.formats.hdf5.write import REPEATED
-from pipeline.formats.read_back import Copy, Fault, in_both_splits, sampled, subtasks_of, unlike
+from pipeline.formats.read_back import (
+    Copy,
+    Fault,
+    in_both_splits,
+    sampled,
+    subtasks_of,
+    too_many_episodes,
+    unlike,
+    wrong_splits,
+)
 from pipeline.images.jpeg import encode_exactly, to_policy
 from pipeline.libero import hdf5
 from pipeline.types import Episode, Extra, Frame, Geometry, Replay, Scene
@@ -81,7 +90,7 @@ def _demos(file: Edition) -> dict[str, str]:
 
 
 def check(
-    root: Path, kept: Mapping[str, Row], content: Content, validation: float = 0.0
+    root: Path, kept: Mapping[str, ManifestRow], content: Content, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the files with the layout, and their episodes with the kept episodes."""
     split_of: dict[str, str] = {}
@@ -92,13 +101,8 @@ def check(
         split_of |= dict.fromkeys(demos.values(), _split_of(root, file))
         with _readable(file), hdf5.opened(file) as opened:
             yield from (("format", fault) for fault in _wrong_file(file, opened, demos, content))
-    # Reading the episodes reports missing ones.
-    if stored > len(kept):
-        what = f"has {stored} episodes, of which some are foreign or repeated"
-        yield "ids", Fault(FORMAT, None, what, f"{len(kept)}")
-    wanted = {"train", "val"} if validation else {"train"}
-    if {*split_of.values()} != wanted:
-        yield "format", Fault(FORMAT, None, f"the splits are {sorted({*split_of.values()})}", f"{sorted(wanted)}")
+    yield from too_many_episodes(FORMAT, stored, len(kept))
+    yield from wrong_splits(FORMAT, {*split_of.values()}, validation)
     yield from in_both_splits(FORMAT, split_of, kept)
 
 
@@ -216,7 +220,7 @@ def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Cop
         action=actions.astype(np.float32),
         action_absolute=group["action_absolute"][()],
         instruction=instruction,
-        provenance={name: _plain(attributes[name]) for name in content.provenance},
+        provenance={name: _as_python_value(attributes[name]) for name in content.provenance},
         geometry={view: _geometry(group, attributes, view, content) for view in content.views},
         object_poses=poses,
         instances=json.loads(attributes[layout.INSTANCES]) if content.has_names else (),
@@ -233,7 +237,7 @@ def _copy(place: Place, group: h5py.Group, content: Content, train: bool) -> Cop
         episode=episode,
         instructions=[instruction] * len(actions),
         decoded=decoded,
-        marks={name: group[array][()] for name, array in MARKS.items()},
+        step_marks={name: group[array][()] for name, array in MARKS.items()},
         place={},
         train=train,
         lossless_frames=partial(_frames, place),
@@ -247,7 +251,7 @@ def scene_of(attributes: Mapping[str, Any]) -> Scene:
     return Scene(model_xml, state, start=layout.start_of(attributes))
 
 
-def _plain(value: Any) -> Any:
+def _as_python_value(value: Any) -> Any:
     """Return an attribute as Python's own type."""
     return value.item() if isinstance(value, np.generic) else value
 

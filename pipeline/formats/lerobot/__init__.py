@@ -12,7 +12,7 @@ from packaging.version import Version
 from pydantic import Field, field_validator
 
 from pipeline.episode_schema import MAPS, MATRICES, STANDARD, Content, GripperSpec
-from pipeline.formats.base import CardFacts, Format, FormatOptions, Name, Row, StepSizes, ValidationShare
+from pipeline.formats.base import CardFacts, Format, FormatOptions, ManifestRow, Name, StepSizes, ValidationShare
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, number_pieces, split
 from pipeline.formats.lerobot.columns import CONVENTIONS, FILE_MB, VIEW_AS_VIDEO_KB, Action, Depth, Layout
 from pipeline.formats.read_back import Copy, Fault
@@ -217,12 +217,12 @@ class LeRobot(Format[LeRobotConfig]):
         with read.readable(self.root):
             read.rows(self.root)
 
-    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+    def check(self, kept: Mapping[str, ManifestRow], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats.lerobot import check
 
         return check.check(self.root, cache, kept, self.layout, self.options.validation)
 
-    def read(self, row: Row) -> Copy | None:
+    def read(self, row: ManifestRow) -> Copy | None:
         from pipeline.formats.lerobot import read
 
         return read.read(self.root, row["episode_id"], self.layout)
@@ -242,7 +242,7 @@ class LeRobot(Format[LeRobotConfig]):
         # lerobot's own upload contains this entry.
         return [{"config_name": "default", "data_files": "data/*/*.parquet"}]
 
-    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+    def loading(self, name: str, repository: str, kept: Sequence[ManifestRow]) -> str:
         return f"""\
 lerobot:
 
@@ -347,7 +347,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
                 sets = by_suite(suites, self.options.name)
             for name, ids in sets.items():
                 folder = f"files/{name}" if split_name == "train" else f"files/{name}_{split_name}"
-                parts = split(ids, -(-len(ids) // EPISODES_OF_A_PIECE))
+                parts = split(ids, ceil(len(ids) / EPISODES_OF_A_PIECE))
                 slices = {f"{folder}/{number:05d}": (split_name, part) for number, part in enumerate(parts)}
                 pieces += number_pieces(slices, episodes.facts)
         return pieces
@@ -369,17 +369,17 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
         read_v21.open_all(self.folder)
 
-    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+    def check(self, kept: Mapping[str, ManifestRow], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats.lerobot import check_v21
 
         return check_v21.check(self.folder, kept, self.layout, self.options.validation)
 
-    def read(self, row: Row) -> Copy | None:
+    def read(self, row: ManifestRow) -> Copy | None:
         from pipeline.formats.lerobot import read_v21
 
         return read_v21.read(self.folder, row["episode_id"], self.layout)
 
-    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+    def loading(self, name: str, repository: str, kept: Sequence[ManifestRow]) -> str:
         actions = self.keys["action"]
         return f"""\
 The repository has the layout that `finetune/` expects of the folder `$DATA`. Each folder below `{self.name}/` is a

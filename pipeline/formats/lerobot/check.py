@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.lerobot.check_shared import as_json, wrong_frames, wrong_in_dataset, wrong_tasks, wrong_video
 from pipeline.formats.lerobot.columns import (
     DATA_PATH,
@@ -54,7 +54,7 @@ SAME_DEPTH_M = 1e-5
 def check(
     root: Path,
     cache: Path,
-    kept: Mapping[str, Row],
+    kept: Mapping[str, ManifestRow],
     layout: Layout,
     validation: float = 0.0,
 ) -> Iterator[tuple[str, Fault]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.base import Row
+from pipeline.formats.base import ManifestRow
 from pipeline.formats.lerobot.check_shared import as_json, wrong_frames, wrong_in_dataset, wrong_tasks, wrong_video
 from pipeline.formats.lerobot.columns import (
     DATA_PATH_V21,
@@ -23,12 +23,12 @@ from pipeline.formats.lerobot.columns import (
 )
 from pipeline.formats.lerobot.read import readable
 from pipeline.formats.lerobot.read_v21 import VERSION, opened, read_lines, sets
-from pipeline.formats.read_back import Fault, in_both_splits, unlike
+from pipeline.formats.read_back import Fault, in_both_splits, unlike, wrong_splits
 from pipeline.formats.stated_statistics import FIGURES
 
 
 def check(
-    folder: Path, kept: Mapping[str, Row], layout: Layout, validation: float = 0.0
+    folder: Path, kept: Mapping[str, ManifestRow], layout: Layout, validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
     """Compare the metadata of the sets with the content of their files.
 
@@ -55,9 +55,7 @@ def check(
     # Reading the episodes reports missing ones.
     for episode_id in split_of.keys() - kept.keys():
         yield "ids", Fault(dataset, episode_id, "is in the dataset", "only kept episodes")
-    splits, wanted = set(split_of.values()), {"train", "val"} if validation else {"train"}
-    if splits != wanted:
-        yield "format", Fault(dataset, None, f"the sets have the splits {sorted(splits)}", f"{sorted(wanted)}")
+    yield from wrong_splits(dataset, {*split_of.values()}, validation, "the sets have the splits")
     yield from in_both_splits(dataset, split_of, kept)
 
 

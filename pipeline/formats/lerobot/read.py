@@ -49,7 +49,7 @@ UNREADABLE = (
 """Exceptions on files that are damaged, missing or do not belong together."""
 
 MARKS = ("frame_index", "timestamp", IS_SUCCESS)
-"""Columns of ``Copy.marks``; only datasets of failures have the last one."""
+"""Columns of ``Copy.step_marks``; only datasets of failures have the last one."""
 
 NUMBERS = ("float32", "int64")
 """Types of the columns that have statistics, in addition to frames."""
@@ -135,9 +135,9 @@ def copy_of(root: Path, row: Mapping[str, Any], layout: Layout) -> Copy:
         episode=episode(table, row, instructions[0], layout),
         instructions=instructions,
         decoded=decoded(times_s, videos),
-        marks=marks(table),
+        step_marks=read_step_marks(table),
         place={"lerobot_episode_index": index},
-        said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
+        persistent_language=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
         events=table[EVENTS].to_pylist() if EVENTS in table.column_names else None,
         train=index < int(info["splits"]["train"].partition(":")[2]),
         statistics=Statistics(
@@ -251,7 +251,7 @@ def v30_columns(stored: pa.Table, layout: Layout) -> pa.Table:
     return stored.rename_columns([v30_names.get(name, name) for name in stored.column_names])
 
 
-def marks(table: pa.Table) -> dict[str, NDArray[Any]]:
+def read_step_marks(table: pa.Table) -> dict[str, NDArray[Any]]:
     """Return the columns of ``MARKS`` that a table has."""
     return {name: table[name].to_numpy() for name in MARKS if name in table.column_names}
 

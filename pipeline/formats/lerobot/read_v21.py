@@ -17,7 +17,15 @@ from pipeline.formats.lerobot.columns import (
     matrix,
     video_path_v21,
 )
-from pipeline.formats.lerobot.read import NUMBERS, decoded, episode, marks, readable, reject_others, v30_columns
+from pipeline.formats.lerobot.read import (
+    NUMBERS,
+    decoded,
+    episode,
+    read_step_marks,
+    readable,
+    reject_others,
+    v30_columns,
+)
 from pipeline.formats.read_back import Copy, Statistics
 
 VERSION = "v2.1"
@@ -62,13 +70,21 @@ def _copy_of(
     if row["tasks"] != [instructions[0]]:
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
     table = v30_columns(stored, layout)
-    made = episode(table, row, instructions[0], layout)
+    copied_episode = episode(table, row, instructions[0], layout)
     keys = layout.views
     videos = {view: (root / video_path_v21(index, key), 0.0) for view, key in keys.items() if layout.frames == "video"}
     numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
     statistics = Statistics(_statistics(root, index), numbers, keys)
     frames = decoded(table["timestamp"].to_pylist(), videos)
-    return Copy(root.parent.name, made, instructions, frames, marks(table), {}, statistics=statistics)
+    return Copy(
+        dataset=root.parent.name,
+        episode=copied_episode,
+        instructions=instructions,
+        decoded=frames,
+        step_marks=read_step_marks(table),
+        place={},
+        statistics=statistics,
+    )
 
 
 def _statistics(root: Path, index: int) -> dict[str, Any]:

@@ -9,7 +9,7 @@ lerobot's own writer of v3.0 appends by writing whole files again. Its statistic
 (huggingface/lerobot#3804) from a sample of the frames.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA, labels_of
 from pipeline.formats.episodes import Load, Piece
-from pipeline.formats.exact_statistics import listed
+from pipeline.formats.exact_statistics import Counts, listed
 from pipeline.formats.lerobot.columns import (
     DATA_PATH,
     FILE_MB,
@@ -32,6 +32,7 @@ from pipeline.formats.lerobot.columns import (
 from pipeline.formats.lerobot.language import language_columns
 from pipeline.formats.lerobot.video import DepthVideo, Video
 from pipeline.formats.lerobot.write_shared import (
+    NumberedEpisode,
     append_depth,
     append_frames,
     data_schema,
@@ -75,33 +76,49 @@ def write_piece(path: Path, piece: Piece, load: Load, layout: Layout) -> None:
         PipelineError: when an episode breaks the schema.
     """
     path.mkdir()
-    rows, summaries = [], []
+    rows, provenance, levels_of_episodes = [], [], []
+    schema = data_schema(layout.columns)
     with ExitStack() as opened:
-        data = opened.enter_context(pq.ParquetWriter(path / DATA, data_schema(layout.columns)))
+        data = opened.enter_context(pq.ParquetWriter(path / DATA, schema))
         videos, depth_videos = {}, {}
         if layout.frames == "video":
             for view in layout.content.views:
                 videos[view] = opened.enter_context(Video(path / f"{view}.mp4", layout.content))
         for view in layout.depth_videos:
             depth_videos[view] = opened.enter_context(DepthVideo(path / f"{view}_depth.mp4", layout.content))
-        for index, first_step, episode, numbers in load_each(piece, load, layout):
-            levels = {view: append_frames(episode, view, videos.get(view)) for view in layout.content.views}
-            for view, video in depth_videos.items():
-                levels[f"{view}_depth"] = append_depth(episode, view, video)
-            columns = step_columns(episode, numbers, layout)
-            if layout.language:
-                columns |= language_columns(episode, layout.content.size_px, train=piece.split == "train")
+        for numbered in load_each(piece, load, layout):
+            levels = _append_pictures(numbered.episode, videos, depth_videos, layout)
             # Each episode is a row group of its own, so that it can be read alone.
-            table = pa.table({name: columns[name] for name in data.schema.names})
-            data.write_table(table.cast(data.schema))
-            row = _episode_row(episode, piece, index, first_step, layout.videos.values())
-            # lerobot's tools for editing aggregate the statistics of the episodes.
-            for name, figures in episode_statistics(numbers, levels, layout).items():
-                row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
-            rows.append(row)
-            summaries.append((provenance_row(episode, index), levels))
+            data.write_table(_steps_table(numbered, piece, layout, schema))
+            rows.append(_episode_row(numbered, piece, levels, layout))
+            provenance.append(provenance_row(numbered))
+            levels_of_episodes.append(levels)
     pq.write_table(_episodes_table(rows), path / EPISODES)
-    write_summary(path, summaries, layout.content)
+    write_summary(path, provenance, levels_of_episodes, layout.content)
+
+
+def _append_pictures(
+    episode: Episode, videos: Mapping[str, Video], depth_videos: Mapping[str, DepthVideo], layout: Layout
+) -> dict[str, Counts]:
+    """Append an episode's frames and depth maps to the videos, by view.
+
+    Returns:
+        Counts of levels by the names of ``Layout.pictures``, also of frames that are stored as images.
+    """
+    levels = {}
+    for view in layout.content.views:
+        levels[view] = append_frames(episode, view, videos.get(view))
+    for view, video in depth_videos.items():
+        levels[f"{view}_depth"] = append_depth(episode, view, video)
+    return levels
+
+
+def _steps_table(numbered: NumberedEpisode, piece: Piece, layout: Layout, schema: pa.Schema) -> pa.Table:
+    """Return the rows of an episode's steps in the data file."""
+    columns = step_columns(numbered, layout)
+    if layout.language:
+        columns |= language_columns(numbered.episode, layout.content.size_px, train=piece.split == "train")
+    return pa.table({name: columns[name] for name in schema.names}).cast(schema)
 
 
 def _episodes_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
@@ -123,9 +140,9 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> N
         places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
         places |= {f"{name}.mp4": (f"videos/{column}", ".mp4") for name, column in layout.videos.items()}
         for name, (kind, suffix) in places.items():
-            made = work / piece.path / name
-            if made.exists():
-                link(made, root / file_path(kind, piece.number, suffix))
+            source = work / piece.path / name
+            if source.exists():
+                link(source, root / file_path(kind, piece.number, suffix))
     tasks = write_common(work, root, pieces, layout)
     # lerobot finds a task by the table's index.
     numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
@@ -150,13 +167,21 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> N
 
 
 def _episode_row(
-    episode: Episode, piece: Piece, index: int, first_step: int, video_columns: Iterable[str]
+    numbered: NumberedEpisode, piece: Piece, levels: Mapping[str, Counts], layout: Layout
 ) -> dict[str, Any]:
-    """Return an episode's row of ``meta/episodes``, which states its place."""
+    """Return an episode's row of ``meta/episodes``, which states its place and its statistics.
+
+    Args:
+        numbered: the episode.
+        piece: its piece.
+        levels: counts of levels by the names of ``Layout.pictures``.
+        layout: layout of the dataset.
+    """
+    episode, first_step = numbered.episode, numbered.first_step
     chunk, file = divmod(piece.number, FILES_OF_A_CHUNK)
     steps = len(episode)
     row = {
-        "episode_index": index,
+        "episode_index": numbered.episode_index,
         "tasks": [episode.instruction],
         "length": steps,
         "data/chunk_index": chunk,
@@ -169,11 +194,14 @@ def _episode_row(
     row |= {name: episode.provenance[name] for name in SELECTED_BY}
     row |= labels_of(episode)
     before = first_step - piece.first_step
-    for key in video_columns:
+    for key in layout.videos.values():
         row |= {
             f"videos/{key}/chunk_index": chunk,
             f"videos/{key}/file_index": file,
             f"videos/{key}/from_timestamp": before / SCHEMA.fps_hz,
             f"videos/{key}/to_timestamp": (before + steps) / SCHEMA.fps_hz,
         }
+    # lerobot's tools for editing aggregate the statistics of the episodes.
+    for name, figures in episode_statistics(numbered.numbers, levels, layout).items():
+        row |= {f"stats/{name}/{figure}": value for figure, value in listed(figures).items()}
     return row

@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import datasets
 import numpy as np
@@ -46,12 +46,24 @@ Numbers = Mapping[str, NDArray[Any]]
 """Column to its values at each step, (T,) or (T, D)."""
 
 
-def load_each(piece: Piece, load: Load, layout: Layout) -> Iterator[tuple[int, int, Episode, Numbers]]:
-    """Load and check each episode of a piece.
+class NumberedEpisode(NamedTuple):
+    """An episode with its place in the dataset.
 
-    Yields:
-        Number of the episode, number of preceding steps, the episode with LIBERO's gripper, and its numeric columns
-        with the gripper of the convention.
+    Attributes:
+        episode_index: number of the episode in the dataset.
+        first_step: number of preceding steps of the dataset.
+        episode: the episode, with LIBERO's gripper.
+        numbers: its columns of numbers, under the names of v3.0 and with the gripper of the convention.
+    """
+
+    episode_index: int
+    first_step: int
+    episode: Episode
+    numbers: Numbers
+
+
+def load_each(piece: Piece, load: Load, layout: Layout) -> Iterator[NumberedEpisode]:
+    """Load and check each episode of a piece.
 
     Raises:
         PipelineError: when an episode breaks the schema.
@@ -60,7 +72,8 @@ def load_each(piece: Piece, load: Load, layout: Layout) -> Iterator[tuple[int, i
     for index, episode_id in enumerate(piece.ids, piece.first_episode):
         episode = load(episode_id)
         check(episode, layout.content)
-        yield index, first_step, episode, _numbers(episode, index, first_step, piece, layout)
+        numbers = _numbers(episode, index, first_step, piece, layout)
+        yield NumberedEpisode(index, first_step, episode, numbers)
         first_step += len(episode)
 
 
@@ -135,12 +148,9 @@ def _numbers(episode: Episode, index: int, first_step: int, piece: Piece, layout
     }
 
 
-def step_columns(episode: Episode, numbers: Numbers, layout: Layout) -> dict[str, pa.Array]:
-    """Return the columns of an episode's steps, with its images if they are stored as such.
-
-    Args:
-        numbers: the columns of numbers, under the names of v3.0.
-    """
+def step_columns(numbered: NumberedEpisode, layout: Layout) -> dict[str, pa.Array]:
+    """Return the columns of an episode's steps, with its images if they are stored as such."""
+    episode = numbered.episode
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, geometry in episode.geometry.items():
         for extra in layout.text_maps:
@@ -152,7 +162,7 @@ def step_columns(episode: Episode, numbers: Numbers, layout: Layout) -> dict[str
             cells = [{"bytes": packed, "path": None} for packed in files]
             images[ALL_VIEWS[view].lerobot_key] = pa.array(cells, image_type)
     stored = {}
-    for name, values in numbers.items():
+    for name, values in numbered.numbers.items():
         if values.ndim == 1:
             stored[name] = pa.array(values)
         else:
@@ -198,9 +208,10 @@ def _provenance_schema(content: Content) -> pa.Schema:
     return pa.schema(stored)
 
 
-def provenance_row(episode: Episode, index: int) -> dict[str, Any]:
+def provenance_row(numbered: NumberedEpisode) -> dict[str, Any]:
     """Return an episode's row of ``meta/provenance.parquet``."""
-    row: dict[str, Any] = {"episode_index": index, **episode.provenance}
+    episode = numbered.episode
+    row: dict[str, Any] = {"episode_index": numbered.episode_index, **episode.provenance}
     for view, geometry in episode.geometry.items():
         row |= {camera_column(view, name): getattr(geometry, name).ravel().tolist() for name in MATRICES}
     if episode.instances:
@@ -209,16 +220,26 @@ def provenance_row(episode: Episode, index: int) -> dict[str, Any]:
 
 
 def write_summary(
-    path: Path, summaries: Sequence[tuple[dict[str, Any], Mapping[str, Counts]]], content: Content
+    path: Path,
+    provenance: Sequence[dict[str, Any]],
+    levels_of_episodes: Sequence[Mapping[str, Counts]],
+    content: Content,
 ) -> None:
-    """Write ``PROVENANCE`` and ``LEVELS`` of a piece, from the provenance and the levels of each episode."""
-    rows, counts_of_episodes = zip(*summaries, strict=True)
-    pq.write_table(pa.Table.from_pylist(list(rows), schema=_provenance_schema(content)), path / PROVENANCE)
-    levels = {}
-    for name in counts_of_episodes[0]:
-        total = sum(counts[name] for counts in counts_of_episodes)
-        levels[name] = total.tolist()
-    (path / LEVELS).write_text(json.dumps(levels))
+    """Write ``PROVENANCE`` and ``LEVELS`` of a piece.
+
+    Args:
+        path: folder of the piece.
+        provenance: row of each episode.
+        levels_of_episodes: counts of levels of each episode, by the names of ``Layout.pictures``.
+        content: content of the episodes.
+    """
+    table = pa.Table.from_pylist(list(provenance), schema=_provenance_schema(content))
+    pq.write_table(table, path / PROVENANCE)
+    total_levels = {}
+    for name in levels_of_episodes[0]:
+        total = np.sum([levels[name] for levels in levels_of_episodes], axis=0)
+        total_levels[name] = total.tolist()
+    (path / LEVELS).write_text(json.dumps(total_levels))
 
 
 def write_common(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> dict[str, int]:
@@ -264,13 +285,13 @@ def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
     return figures | {"count": np.array([len(values)])}
 
 
-def link(made: Path, place: Path) -> None:
+def link(source: Path, target: Path) -> None:
     """Link a file to a second place; the first place stays, for a call that resumes where this one was killed."""
-    place.parent.mkdir(parents=True, exist_ok=True)
+    target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        os.link(made, place)
+        os.link(source, target)
     except OSError:  # a file system without links
-        shutil.copyfile(made, place)
+        shutil.copyfile(source, target)
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:

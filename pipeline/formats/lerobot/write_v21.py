@@ -8,6 +8,7 @@ final. The files about all episodes come at the end. ``meta/stats.json`` is no p
 import json
 from collections.abc import Sequence
 from contextlib import ExitStack
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from pipeline.formats.lerobot.columns import (
 )
 from pipeline.formats.lerobot.video import Video
 from pipeline.formats.lerobot.write_shared import (
-    Numbers,
+    NumberedEpisode,
     append_frames,
     data_schema,
     episode_statistics,
@@ -42,7 +43,6 @@ from pipeline.formats.lerobot.write_shared import (
     write_json,
     write_summary,
 )
-from pipeline.types import Episode
 
 LINES = ("episodes.jsonl", "episodes_stats.jsonl")
 """Further files in a piece's folder, in addition to the files of its episodes."""
@@ -60,30 +60,27 @@ def write_piece(path: Path, piece: Piece, load: Load, layout: Layout) -> None:
         PipelineError: when an episode breaks the schema.
     """
     path.mkdir()
-    summaries = []
+    provenance, levels_of_episodes = [], []
     with ExitStack() as opened:
         episodes, stats = (opened.enter_context((path / name).open("w")) for name in LINES)
-        for index, _, episode, numbers in load_each(piece, load, layout):
-            levels = _write_episode(path, index, episode, numbers, layout)
+        for numbered in load_each(piece, load, layout):
+            index, episode = numbered.episode_index, numbered.episode
+            levels = _write_episode(path, numbered, layout)
             figures = {}
-            for name, all_figures in episode_statistics(numbers, levels, layout).items():
+            for name, all_figures in episode_statistics(numbered.numbers, levels, layout).items():
                 figures[name] = listed({figure: all_figures[figure] for figure in STATISTICS})
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
             row |= {"episode_id": episode.episode_id, **labels_of(episode)}
             episodes.write(json.dumps(row) + "\n")
             stats.write(json.dumps({"episode_index": index, "stats": figures}) + "\n")
-            summaries.append((provenance_row(episode, index), levels))
-    write_summary(path, summaries, layout.content)
+            provenance.append(provenance_row(numbered))
+            levels_of_episodes.append(levels)
+    write_summary(path, provenance, levels_of_episodes, layout.content)
 
 
-def _write_episode(
-    path: Path,
-    index: int,
-    episode: Episode,
-    numbers: Numbers,
-    layout: Layout,
-) -> dict[str, Counts]:
+def _write_episode(path: Path, numbered: NumberedEpisode, layout: Layout) -> dict[str, Counts]:
     """Write the files of one episode and return the counts of levels of its views."""
+    index, episode = numbered.episode_index, numbered.episode
     levels = {}
     for view, column in layout.views.items():
         if layout.frames == "video":
@@ -93,7 +90,7 @@ def _write_episode(
                 levels[view] = append_frames(episode, view, video)
         else:
             levels[view] = append_frames(episode, view, None)
-    columns = step_columns(episode, numbers, layout)
+    columns = step_columns(numbered, layout)
     schema = _schema(layout)
     file = path / data_path_v21(index)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -113,8 +110,8 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> N
     """Link the files of a set's pieces to their places below ``root``, and write the files about all episodes."""
     (root / "meta").mkdir(parents=True)
     for piece in pieces:
-        for made in sorted((work / piece.path).glob("*/**/episode_*")):
-            link(made, root / made.relative_to(work / piece.path))
+        for source in sorted((work / piece.path).glob("*/**/episode_*")):
+            link(source, root / source.relative_to(work / piece.path))
     for name in LINES:
         texts = [(work / piece.path / name).read_text() for piece in pieces]
         (root / "meta" / name).write_text("".join(texts))
@@ -129,7 +126,7 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], layout: Layout) -> N
     info = {
         **numbers,
         "total_videos": episodes * len(layout.content.views) if videos else 0,
-        "total_chunks": -(-episodes // FILES_OF_A_CHUNK),
+        "total_chunks": ceil(episodes / FILES_OF_A_CHUNK),
         "chunks_size": FILES_OF_A_CHUNK,
         "fps": SCHEMA.fps_hz,
         "splits": {"train": f"0:{episodes}"},

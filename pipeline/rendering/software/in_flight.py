@@ -99,7 +99,7 @@ class InFlightRenderer(PlainRenderer):
         return PixelBuffers(self._context, BUFFERS, self.size_px)
 
     def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
-        """Start to render a frame; see ``PlainRenderer``. Up to ``BUFFERS`` frames are in flight at a time."""
+        """Start to render a frame; see ``ModelRenderer``. Up to ``BUFFERS`` frames are in flight at a time."""
         self._gl.make_current()
         self._render_frame(data, camera)
         number = self._buffers.start_copy()

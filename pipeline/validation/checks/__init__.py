@@ -37,11 +37,12 @@ def _has_video(case: Case) -> bool:
 
 
 def _has_depth_video(case: Case) -> bool:
-    return any(copy.depth_m for copy in case.whole)
+    return any(copy.depth_m for copy in case.comparable_copies)
 
 
 def _has_boxes_and_masks(case: Case) -> bool:
-    return any(made.boxes is not None and "segmentation" in made.maps for made in case.made.geometry.values())
+    views = case.episode.geometry.values()
+    return any(geometry.boxes is not None and "segmentation" in geometry.maps for geometry in views)
 
 
 CHECKS: Mapping[str, Check] = {

@@ -21,28 +21,28 @@ NEAREST_DEPTH_M = 0.01
 
 def check_geometry(case: Case) -> Iterator[Fault]:
     """Check the matrices of the cameras, bit for bit, and the files and numbers of the extras."""
-    for copy in case.whole:
-        for view, made in case.made.geometry.items():
+    for copy in case.comparable_copies:
+        for view, geometry in case.episode.geometry.items():
             for name in MATRICES:
-                matrix, expected = getattr(copy.episode.geometry[view], name), getattr(made, name)
+                matrix, expected = getattr(copy.episode.geometry[view], name), getattr(geometry, name)
                 if matrix.dtype != expected.dtype or not np.array_equal(matrix, expected):
                     yield case.finding(copy.dataset, f"{view}_{name} is {matrix.tolist()}", expected.tolist())
-            for name, files in made.maps.items():
+            for name, files in geometry.maps.items():
                 if name == "depth" and copy.depth_m:
                     continue  # ``depth`` compares videos.
                 if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
-            if not same_bits(copy.episode.geometry[view].boxes, made.boxes):
+            if not same_bits(copy.episode.geometry[view].boxes, geometry.boxes):
                 yield case.finding(copy.dataset, f"{view}_boxes differ", "the stored boxes")
-        if not same_bits(copy.episode.object_poses, case.made.object_poses):
+        if not same_bits(copy.episode.object_poses, case.episode.object_poses):
             yield case.finding(copy.dataset, "object_poses differ", "the stored poses")
-        if list(copy.episode.instances) != list(case.made.instances):
-            yield case.finding(copy.dataset, f"instances {list(copy.episode.instances)}", list(case.made.instances))
+        if list(copy.episode.instances) != list(case.episode.instances):
+            yield case.finding(copy.dataset, f"instances {list(copy.episode.instances)}", list(case.episode.instances))
 
 
 def check_depth(case: Case) -> Iterator[Fault]:
     """Check that depth in videos is within half a code of the stored depth."""
-    for copy in case.whole:
+    for copy in case.comparable_copies:
         for (view, step), depth_m in copy.depth_m.items():
             expected_m = np.maximum(case.sampled_depth_m[view, step], NEAREST_DEPTH_M)
             if depth_m.shape != expected_m.shape:
@@ -60,21 +60,21 @@ def check_boxes(case: Case) -> Iterator[Fault]:
 
     The masks give the boxes of the gripper and of the things that the goal names.
     """
-    if not case.made.instances:
+    if not case.episode.instances:
         return  # Neither boxes nor masks are stored.
-    places = [case.made.instances.index("gripper"), *_list_goal_places(case)]
-    for view, made in case.made.geometry.items():
-        if made.boxes is None or "segmentation" not in made.maps:
+    places = [case.episode.instances.index("gripper"), *_list_goal_places(case)]
+    for view, geometry in case.episode.geometry.items():
+        if geometry.boxes is None or "segmentation" not in geometry.maps:
             continue
-        for step in sampled(len(case.made)):
-            ids = decode_exactly(made.maps["segmentation"][step])
-            expected = np.zeros_like(made.boxes[step])
+        for step in sampled(len(case.episode)):
+            ids = decode_exactly(geometry.maps["segmentation"][step])
+            expected = np.zeros_like(geometry.boxes[step])
             for place in places:
                 # OpenCV's rectangle has the first column and row, and the numbers of columns and rows.
                 expected[place] = cv2.boundingRect(np.asarray(ids == place, np.uint8))
-            wrong = np.flatnonzero(np.any(expected != made.boxes[step], axis=1))
+            wrong = np.flatnonzero(np.any(expected != geometry.boxes[step], axis=1))
             if len(wrong):
-                what = f"{view}_boxes of step {step} has {made.boxes[step][wrong[0]].tolist()} at place {wrong[0]}"
+                what = f"{view}_boxes of step {step} has {geometry.boxes[step][wrong[0]].tolist()} at place {wrong[0]}"
                 yield case.finding("frames", what, expected[wrong[0]].tolist())
                 break
 
@@ -82,4 +82,4 @@ def check_boxes(case: Case) -> Iterator[Fault]:
 def _list_goal_places(case: Case) -> list[int]:
     """List the places in ``instances`` of the things that the task's goal names."""
     things = definition_of(case.task).things_of_goal
-    return [place for place, name in enumerate(case.made.instances) if name in things]
+    return [place for place, name in enumerate(case.episode.instances) if name in things]

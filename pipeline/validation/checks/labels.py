@@ -13,14 +13,13 @@ from pipeline.episode_schema import SCHEMA, labels_of
 from pipeline.formats.annotations import event_annotations, persistent_annotations
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, exceeds_step_limit
-from pipeline.run.manifest import OWN_VERSION
-from pipeline.run.manifest import labels_of as labels_of_row
+from pipeline.run.manifest import OWN_VERSION, read_labels
 from pipeline.validation.case import Case
 
 
 def check_instruction(case: Case) -> Iterator[Fault]:
     """Check the instruction at every step, and lerobot's language columns."""
-    for copy in case.whole:
+    for copy in case.comparable_copies:
         wrong = set(copy.instructions) - {case.row["instruction"]}
         if wrong:
             yield case.finding(copy.dataset, f"instruction {min(wrong)!r}", repr(case.row["instruction"]))
@@ -30,15 +29,15 @@ def check_instruction(case: Case) -> Iterator[Fault]:
 def _compare_language(case: Case, copy: Copy) -> Iterator[Fault]:
     """Check the entries of the language columns, at the first step of each column that has others."""
     expected = _list_language_entries(case, copy.train)
-    for step, stored in enumerate(copy.said or ()):
+    for step, stored in enumerate(copy.persistent_language or ()):
         entries = [(*_read_entry(row), np.float32(row["timestamp"]), row["camera"]) for row in stored]
         if entries != expected:
             yield _describe_other_entries(case, copy, f"language column of step {step}", entries, expected)
             break
     if copy.events is None:
         return
-    size_px = next(iter(case.stored["image"].frames.values())).shape[0]
-    traces = event_annotations(case.made, size_px)
+    size_px = next(iter(case.sampled_views["image"].frames.values())).shape[0]
+    traces = event_annotations(case.episode, size_px)
     for step, stored in enumerate(copy.events):
         event_entries = [(*_read_entry(row), row["camera"]) for row in stored]
         notes = [(note.role, note.style, note.text, note.camera) for note in traces if note.step == step]
@@ -49,14 +48,14 @@ def _compare_language(case: Case, copy: Copy) -> Iterator[Fault]:
 
 def _list_language_entries(case: Case, train: bool) -> list[tuple[str, str, str, np.float32, None]]:
     """List the persistent entries: the manifest's wordings (in the training split only), subtasks and motions."""
-    rewrites = case.made.rewrites if train else ()
+    rewrites = case.episode.rewrites if train else ()
     entries: list[tuple[str, str, str, np.float32, None]] = []
     if rewrites:
         texts = dict.fromkeys([case.row["instruction"], *rewrites])
         entries += [("user", "task_aug", text, np.float32(0), None) for text in texts]
-    for subtask in case.made.subtasks:
+    for subtask in case.episode.subtasks:
         entries.append(("assistant", "subtask", subtask.text, np.float32(subtask.step / SCHEMA.fps_hz), None))
-    for note in persistent_annotations(case.made, train=False):
+    for note in persistent_annotations(case.episode, train=False):
         if note.style == "motion":
             entries.append((note.role, note.style, note.text, note.time_s, None))
     return entries
@@ -76,13 +75,13 @@ def _describe_other_entries(
 
 def check_labels(case: Case) -> Iterator[Fault]:
     """Check the subtasks and rewrites of the manifest, and compare all copies with the manifest."""
-    stated = labels_of_row(case.row)
+    stated = read_labels(case.row)
     if stated is None:
         yield case.finding("manifest", "has no subtasks and rewrites", "lists, which may be empty")
         return
-    for what, expected in label_faults(stated, len(case.made)):
+    for what, expected in label_faults(stated, len(case.episode)):
         yield case.finding("manifest", what, expected)
-    for dataset, episode in (("frames", case.made), *((copy.dataset, copy.episode) for copy in case.copies)):
+    for dataset, episode in (("frames", case.episode), *((copy.dataset, copy.episode) for copy in case.copies)):
         for name, stored in labels_of(episode).items():
             if stored != stated[name]:
                 yield case.finding(dataset, f"{name} is {stored}", stated[name])
@@ -109,7 +108,7 @@ def check_provenance(case: Case) -> Iterator[Fault]:
     This project's version may differ, because a manifest can be newer than its dataset.
     """
     for copy in case.copies:
-        for column in case.made.provenance:
+        for column in case.episode.provenance:
             value, expected = copy.episode.provenance.get(column), case.row[column]
             if value != expected and column != OWN_VERSION:
                 yield case.finding(copy.dataset, f"{column} is {value!r}", repr(expected))

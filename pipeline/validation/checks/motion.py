@@ -36,7 +36,7 @@ In each of 1,500 episodes with changes they moved 0.005 m or more with it, and 0
 def check_length(case: Case) -> Iterator[Fault]:
     """Check that every place has as many steps as the replay executed."""
     steps = len(case.trajectory.actions)
-    places = [("manifest", case.row["steps"]), ("frames", len(case.made))]
+    places = [("manifest", case.row["steps"]), ("frames", len(case.episode))]
     places += [(copy.dataset, len(copy)) for copy in case.copies]
     for dataset, number in places:
         if number != steps:
@@ -46,23 +46,23 @@ def check_length(case: Case) -> Iterator[Fault]:
 def check_motion(case: Case) -> Iterator[Fault]:
     """Check actions, states and joint angles, bit for bit; actions and joint angles must be the replay's."""
     replay = case.trajectory
-    if not same_bits(case.made.joint_state, replay.states[:-1, ARM].astype(np.float32)):
+    if not same_bits(case.episode.joint_state, replay.states[:-1, ARM].astype(np.float32)):
         yield case.finding("frames", "has other joint angles", "the joint angles of the replay")
-    if not same_bits(case.made.action, replay.actions.astype(np.float32)):
+    if not same_bits(case.episode.action, replay.actions.astype(np.float32)):
         yield case.finding("frames", "has other actions", "the actions of the replay")
     else:
         yield from _compare_goals(case)
     for copy in case.copies:
         # Copies of another length cannot be compared; ``length`` reports them.
-        for name in MOTION if len(copy) == len(case.made) else ():
-            values, made = getattr(copy.episode, name), getattr(case.made, name)
-            if (values.shape, values.dtype) != (made.shape, made.dtype):
-                what, expected = f"{values.shape} of {values.dtype}", f"{made.shape} of {made.dtype}"
+        for name in MOTION if len(copy) == len(case.episode) else ():
+            values, stored = getattr(copy.episode, name), getattr(case.episode, name)
+            if (values.shape, values.dtype) != (stored.shape, stored.dtype):
+                what, expected = f"{values.shape} of {values.dtype}", f"{stored.shape} of {stored.dtype}"
                 yield case.finding(copy.dataset, f"{name} is {what}", expected)
-            elif not same_bits(values, made):
-                step = next(t for t in range(len(made)) if not same_bits(values[t], made[t]))
+            elif not same_bits(values, stored):
+                step = next(t for t in range(len(stored)) if not same_bits(values[t], stored[t]))
                 what = f"{name} of step {step} is {values[step].tolist()}"
-                yield case.finding(copy.dataset, what, made[step].tolist())
+                yield case.finding(copy.dataset, what, stored[step].tolist())
         yield from _compare_replay(case, copy)
 
 
@@ -89,25 +89,25 @@ def _compare_goals(case: Case) -> Iterator[Fault]:
 
     The goal of the orientation is compared at steps that turn the hand; at others, it is a former goal.
     """
-    made, spec = case.made, SCHEMA.action
-    deltas = np.clip(made.action[:, :6].astype(float), *spec.range) * spec.units
-    goals = made.action_absolute.astype(float)
-    positions_m = made.state[:, :3] + deltas[:, :3]
+    episode, spec = case.episode, SCHEMA.action
+    deltas = np.clip(episode.action[:, :6].astype(float), *spec.range) * spec.units
+    goals = episode.action_absolute.astype(float)
+    positions_m = episode.state[:, :3] + deltas[:, :3]
     turns = np.any(deltas[:, 3:] != 0, axis=1)
-    hands = Rotation.from_rotvec(made.state[:, 3:6]) * GRIP_IN_HAND
+    hands = Rotation.from_rotvec(episode.state[:, 3:6]) * GRIP_IN_HAND
     apart = Rotation.from_rotvec(goals[:, 3:6]).inv() * Rotation.from_rotvec(deltas[:, 3:]) * hands
     if np.abs(goals[:, :3] - positions_m).max() > GOAL_TOLERANCE:
         yield case.finding("frames", "action_absolute has other positions", "state plus delta")
     if np.any(apart.magnitude()[turns] > GOAL_TOLERANCE):
         yield case.finding("frames", "action_absolute has other orientations", "state turned by delta")
-    if not same_bits(made.action_absolute[:, 6], made.action[:, 6]):
+    if not same_bits(episode.action_absolute[:, 6], episode.action[:, 6]):
         yield case.finding("frames", "action_absolute has other gripper commands", "those of action")
 
 
 def check_gripper(case: Case) -> Iterator[Fault]:
     """Check that commands are -1 or +1, and that the fingers open and close accordingly."""
     commands = SCHEMA.action.gripper
-    for copy in case.whole:
+    for copy in case.comparable_copies:
         command, state = copy.episode.action[:, 6], copy.episode.state
         strange = commands.others(command)
         if strange:
@@ -151,8 +151,8 @@ def check_clock(case: Case) -> Iterator[Fault]:
 
 
 def _compare_marks(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Iterator[Fault]:
-    for name in sorted(copy.marks.keys() & wanted.keys()):
-        values, expected = copy.marks[name], wanted[name]
+    for name in sorted(copy.step_marks.keys() & wanted.keys()):
+        values, expected = copy.step_marks[name], wanted[name]
         for step in np.flatnonzero(~np.isclose(values, expected, rtol=0, atol=1e-4))[:1]:
             what = f"{name} of step {step} is {float(values[step]):g}"
             yield case.finding(copy.dataset, what, f"{float(expected[step]):g}")

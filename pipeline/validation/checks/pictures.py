@@ -41,7 +41,7 @@ def check_jpeg(case: Case) -> Iterator[Fault]:
     """Check that the image files of a dataset have the bytes of the stored frames, and lossless frames their pixels."""
     for copy in case.copies:
         for view, files in copy.episode.frames.items():
-            pairs = zip(files, case.made.frames[view], strict=False)
+            pairs = zip(files, case.episode.frames[view], strict=False)
             wrong = [step for step, (file, stored) in enumerate(pairs) if file != stored]
             if wrong:
                 what = f"{view} differs at {len(wrong)} steps, first at {wrong[0]}"
@@ -52,7 +52,7 @@ def check_jpeg(case: Case) -> Iterator[Fault]:
 
 def _compare_pixels(case: Case, copy: Copy, frames_of: Callable[[str], Iterator[Frame]]) -> Iterator[Fault]:
     """Compare every frame of a copy with the decoded JPEG file of its step."""
-    for view, files in case.made.frames.items():
+    for view, files in case.episode.frames.items():
         try:
             pairs = zip(frames_of(view), files, strict=False)
             wrong = [step for step, (frame, file) in enumerate(pairs) if not np.array_equal(frame, decode(file))]
@@ -67,7 +67,7 @@ def _compare_pixels(case: Case, copy: Copy, frames_of: Callable[[str], Iterator[
 def check_video(case: Case) -> Iterator[Fault]:
     """Check that frames of videos are within ``VIDEO_PSNR_DB`` and ``COLOURS_OFF`` of the stored frames."""
     for shown_view in case.shown_views:
-        stored, within = case.stored[shown_view.view], f"{VIDEO_PSNR_DB} or more"
+        stored, within = case.sampled_views[shown_view.view], f"{VIDEO_PSNR_DB} or more"
         for step, frame in shown_view.frames.items() if shown_view.video else ():
             name = f"{shown_view.view} of step {step}"
             psnr_db = cv2.PSNR(shown_view.grey[step], stored.grey[step])
@@ -95,8 +95,8 @@ def check_cameras(case: Case) -> Iterator[Fault]:
     """Check that no view shows the picture of another camera."""
     for shown_view in case.shown_views:
         for step, frame in shown_view.grey.items():
-            for view in case.stored.keys() - {shown_view.view}:
-                if cv2.PSNR(frame, case.stored[view].grey[step]) > VIDEO_PSNR_DB:
+            for view in case.sampled_views.keys() - {shown_view.view}:
+                if cv2.PSNR(frame, case.sampled_views[view].grey[step]) > VIDEO_PSNR_DB:
                     yield case.finding(
                         shown_view.dataset, f"{shown_view.view} of step {step} shows {view}", "its own camera"
                     )

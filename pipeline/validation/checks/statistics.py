@@ -11,7 +11,7 @@ from pipeline.validation.case import Case
 
 def check_statistics(case: Case) -> Iterator[Fault]:
     """Compare each episode's statistics with its numbers, and those of its views with the stored frames."""
-    for copy in case.whole:
+    for copy in case.comparable_copies:
         statistics = copy.statistics
         if statistics is None:
             continue
@@ -30,14 +30,14 @@ def check_statistics(case: Case) -> Iterator[Fault]:
             if lacking:
                 wrong += lacking
                 continue
-            wrong += wrong_sample(column, stated, case.sampled_levels[view], len(case.made))
-            if case.witness:
+            wrong += wrong_sample(column, stated, case.sampled_levels[view], len(case.episode))
+            if case.decodes_all_frames:
                 wrong += wrong_pixels(column, stated, case.levels[view], quantiles)
         for view, column in statistics.depth.items():
             stated = stored.get(column, {})
             lacking = [*complete(column, stated, figures, 1)]
             sample_m = [map_m for (name, _), map_m in case.sampled_depth_m.items() if name == view]
-            maps_m = case.depth_m(view) if case.witness else np.stack(sample_m)
-            wrong += lacking or wrong_depth(column, stated, maps_m, len(case.made), quantiles)
+            maps_m = case.depth_m(view) if case.decodes_all_frames else np.stack(sample_m)
+            wrong += lacking or wrong_depth(column, stated, maps_m, len(case.episode), quantiles)
         for what, expected in wrong:
             yield case.finding(copy.dataset, what, expected)
