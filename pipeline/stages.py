@@ -85,7 +85,7 @@ def write_inputs(run: Run) -> None:
     write_json(run.path(INPUTS), inputs.listing(run.config))
     run.trajectories.notice_changes()
     run.frames.notice_changes()
-    for dataset in (*run.formats, *run.failure_formats):
+    for dataset in (*run.datasets, *run.failure_datasets):
         export.notice_changes(dataset)
     export.unlist_lost_records(run)
     write_json(run.path(SETTINGS), inputs.settings(run.config))
@@ -205,7 +205,7 @@ def _export(group: str) -> Stage:
         """Return a changed or missing file of the finished datasets, or their list of records if it is missing."""
         if not run.path(DATASETS).exists():
             return run.path(DATASETS)
-        datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
+        datasets = [dataset for dataset in run.recorded_datasets if dataset.group == group]
         return next(filter(None, map(dataset_files.changed_file, datasets)), None)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
@@ -224,7 +224,7 @@ def write_manifest(run: Run) -> None:
     config, outcome = run.config, run.outcome
     table = manifest.build(
         outcome,
-        registry.places(run.formats),
+        registry.places(run.datasets),
         registry.columns(),
         config.export.where,
         lambda row: list_episode_rewrites(config.plan.axes.language, row.suite, row.task, row.perturbations),
@@ -281,7 +281,7 @@ def write_recipe(run: Run) -> None:
     config = run.config
     probability = config.finetune.rewrite_probability
     built = recipe.build(run.manifest_file, run.manifest, config.export, probability, config.render.content)
-    folders = {dataset.name: dataset.folder for dataset in run.formats}
+    folders = {dataset.name: dataset.folder for dataset in run.datasets}
     recipe.write(built, run.path(FINETUNE), config.export, folders)
     file = run.path(FINETUNE) / RECIPE
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
@@ -291,7 +291,7 @@ def summarize(run: Run) -> None:
     """Render contact sheets, of the run and of one task per suite, and print the run's counts."""
     from pipeline.report import preview, sheets
 
-    sheets.write(run.manifest, run.episodes(), run.path(SHEETS))
+    sheets.write(run.manifest, run.episode_loader(), run.path(SHEETS))
     previews = finished.previews_memory(run)
     if not previews.holds():
         with run.workers(renders=True) as workers:

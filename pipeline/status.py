@@ -162,7 +162,7 @@ def _reason_to_run(name: str, run: Run) -> str | None:
 def _stale_datasets(run: Run) -> dict[str, str]:
     """Map the stages ``export_<group>`` that would write a dataset again to the reasons."""
     reasons: dict[str, list[str]] = {}
-    for dataset in (*run.formats, *(run.failure_formats if run.outcome.failures else ())):
+    for dataset in (*run.datasets, *(run.failure_datasets if run.outcome.failures else ())):
         episodes = dataset_basis.episodes_of(dataset, run)
         changed_file = dataset_files.changed_file(dataset)
         if changed_file is not None:

@@ -133,7 +133,7 @@ def stage_memory(
 
 def validate_memory(run: Run) -> Memory:
     """Return the memory of ``validate``, which passed on the recorded contents."""
-    stores, formats = (run.trajectories, run.frames), run.recorded_formats
+    stores, formats = (run.trajectories, run.frames), run.recorded_datasets
     files = [run.path(name) for name in (PLAN, MANIFEST, COUNTS, STATISTICS, INPUTS)]
     files += [store.root / TABLE for store in stores]
     files += [dataset.record_file for dataset in formats]

@@ -47,7 +47,7 @@ def upcoming(run: Run) -> Sequence[plan.Row]:
     """
     if is_up_to_date(run):
         return run.plan
-    records = [dataset.record_file for dataset in run.formats]
+    records = [dataset.record_file for dataset in run.datasets]
     written = (run.plan_file, run.trajectories.root / TABLE, run.frames.root / TABLE, *records)
     return make(run.config) if any(file.exists() for file in written) else []
 
