@@ -86,4 +86,4 @@ def outdated(dataset: AnyFormat, episodes: Episodes) -> Counter[str]:
     basis = compute_basis(dataset, episodes)
     if record.matches(basis) or not record.same_request(basis):
         return Counter()
-    return Counter({f"files, generated with {record.why_not(basis)}": len(record.files)})
+    return Counter({f"files, generated with {record.describe_mismatch(basis)}": len(record.files)})

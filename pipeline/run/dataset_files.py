@@ -84,6 +84,15 @@ def changed_file(dataset: AnyFormat) -> Path | None:
     return None
 
 
+def first_changed_file(datasets: Sequence[AnyFormat]) -> Path | None:
+    """Return the ``changed_file`` of the first dataset that has one; `None` if all datasets are unchanged."""
+    for dataset in datasets:
+        file = changed_file(dataset)
+        if file is not None:
+            return file
+    return None
+
+
 def foreign_files(dataset: AnyFormat) -> list[Path]:
     """List the foreign files in the folder of a finished dataset.
 

@@ -316,5 +316,5 @@ class Store(ABC):
             if record is None:
                 reasons["unrecorded versions and settings"] += 1
             elif record.same_request(self.basis):
-                reasons[str(record.why_not(self.basis))] += 1
+                reasons[str(record.describe_mismatch(self.basis))] += 1
         return reasons
