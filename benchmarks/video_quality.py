@@ -81,7 +81,7 @@ def _of_run(run: Run) -> dict[str, Any]:
     """Return the decibels of a run's videos to its stored frames: mean, worst and the share below 37, by axis."""
     rows = [row for row in run.manifest if row["kept"]]
     rows.sort(key=lambda row: row["lerobot_episode_index"])
-    root, episodes = run.dataset("lerobot").root, run.episodes()
+    root, episodes = run.dataset("lerobot").root, run.episode_loader()
     played = {view: _played(root / "videos" / SCHEMA.views[view].lerobot_key) for view in SCHEMA.views}
     measured: dict[str, list[float]] = defaultdict(list)
     for row in rows:

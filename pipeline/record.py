@@ -57,7 +57,7 @@ class Record:
         """Return whether the requests are equal, so that only the installation or the machine can differ."""
         return bool(self.basis.requested == basis.requested)
 
-    def why_not(self, basis: Basis, unnamed: Collection[str] = ()) -> str | None:
+    def describe_mismatch(self, basis: Basis, unnamed: Collection[str] = ()) -> str | None:
         """Describe why the record does not match; `None` if it does.
 
         Args:

@@ -25,7 +25,7 @@ from pipeline.planning import leakage, plan
 from pipeline.run import counts, dataset_files, dropped, export, finished, inputs, machine, manifest, plan_stage
 from pipeline.run.claim import claim_folder, locked
 from pipeline.run.cleaning import say_stale
-from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
+from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, StageRecord
 from pipeline.run.foreign import reject_foreign_files
 from pipeline.run.layout import (
     CARD,
@@ -60,13 +60,13 @@ class Stage:
     """A step of a run.
 
     Attributes:
-        work: function that performs the stage. A stage without outputs and memory runs every time.
+        work: function that performs the stage. A stage without outputs and record runs every time.
         settings: sections of ``settings.json`` that its outputs depend on.
         inputs: files and folders of the run that it reads.
         outputs: files and folders of the run that it writes.
         changed_file: function that returns a stored file behind the outputs that was changed or deleted, such as a
             shard behind the record of its dataset; `None` if all of them are unchanged.
-        memory: function that returns the memory of the last call, if it does not follow from settings, inputs and
+        record: function that returns the record of the last call, if it does not follow from settings, inputs and
             outputs.
         unchanged: function that is called in place of ``work`` if the outputs are up to date.
     """
@@ -76,7 +76,7 @@ class Stage:
     inputs: Sequence[str] = ()
     outputs: Sequence[str] = ()
     changed_file: Callable[[Run], Path | None] | None = None
-    memory: Callable[[Run], Memory] | None = None
+    record: Callable[[Run], StageRecord] | None = None
     unchanged: Callable[[Run], None] | None = None
 
 
@@ -85,7 +85,7 @@ def write_inputs(run: Run) -> None:
     write_json(run.path(INPUTS), inputs.listing(run.config))
     run.trajectories.notice_changes()
     run.frames.notice_changes()
-    for dataset in (*run.formats, *run.failure_formats):
+    for dataset in (*run.datasets, *run.failure_datasets):
         export.notice_changes(dataset)
     export.unlist_lost_records(run)
     write_json(run.path(SETTINGS), inputs.settings(run.config))
@@ -96,7 +96,7 @@ def doctor(run: Run) -> None:
     from pipeline.validation import doctor as doctor_checks
 
     try:
-        tried = finished.trial_memory(run, gl.choose().device).holds()
+        tried = finished.trial_record(run, gl.choose().device).is_up_to_date()
     except PipelineError:
         # The table of `doctor_checks.run` reports missing packages.
         tried = False
@@ -112,7 +112,7 @@ def doctor(run: Run) -> None:
     trial = machine.trial()
     if not tried:
         machine.record(run, trial.digests)
-        finished.trial_memory(run, gl.choose().device).keep()
+        finished.trial_record(run, gl.choose().device).write()
     machine.keep_speed(run, trial.speed)
 
 
@@ -205,8 +205,8 @@ def _export(group: str) -> Stage:
         """Return a changed or missing file of the finished datasets, or their list of records if it is missing."""
         if not run.path(DATASETS).exists():
             return run.path(DATASETS)
-        datasets = [dataset for dataset in run.recorded_formats if dataset.group == group]
-        return next(filter(None, map(dataset_files.changed_file, datasets)), None)
+        datasets = [dataset for dataset in run.recorded_datasets if dataset.group == group]
+        return dataset_files.first_changed_file(datasets)
 
     write_datasets.__doc__ = f"Write the kept episodes as {' and '.join(kind.title for kind in kinds)}."
     records_of_failures = [f"{FAILURES}/{record}" for record in records]
@@ -224,7 +224,7 @@ def write_manifest(run: Run) -> None:
     config, outcome = run.config, run.outcome
     table = manifest.build(
         outcome,
-        registry.places(run.formats),
+        registry.places(run.datasets),
         registry.columns(),
         config.export.where,
         lambda row: list_episode_rewrites(config.plan.axes.language, row.suite, row.task, row.perturbations),
@@ -281,7 +281,7 @@ def write_recipe(run: Run) -> None:
     config = run.config
     probability = config.finetune.rewrite_probability
     built = recipe.build(run.manifest_file, run.manifest, config.export, probability, config.render.content)
-    folders = {dataset.name: dataset.folder for dataset in run.formats}
+    folders = {dataset.name: dataset.folder for dataset in run.datasets}
     recipe.write(built, run.path(FINETUNE), config.export, folders)
     file = run.path(FINETUNE) / RECIPE
     print(f"wrote {file}, with the recipe and a command line for each of {', '.join(built['clients'])}")
@@ -291,12 +291,12 @@ def summarize(run: Run) -> None:
     """Render contact sheets, of the run and of one task per suite, and print the run's counts."""
     from pipeline.report import preview, sheets
 
-    sheets.write(run.manifest, run.episodes(), run.path(SHEETS))
-    previews = finished.previews_memory(run)
-    if not previews.holds():
+    sheets.write(run.manifest, run.episode_loader(), run.path(SHEETS))
+    previews = finished.previews_record(run)
+    if not previews.is_up_to_date():
         with run.workers(renders=True) as workers:
             preview.for_run(run.config, run.path(PREVIEWS), workers)
-        previews.keep()
+        previews.write()
     print_counts(run)
 
 
@@ -348,7 +348,7 @@ _LABELLED = ("filter", "export", "plan")
 STAGES = {
     "inputs": Stage(work=write_inputs),
     "doctor": Stage(work=doctor, settings=(*inputs.SECTIONS, "host"), inputs=(INPUTS,), outputs=(MACHINE,)),
-    "plan": Stage(work=make_plan, memory=plan_stage.memory),
+    "plan": Stage(work=make_plan, record=plan_stage.record),
     "leakage": Stage(work=check_leakage, inputs=(PLAN,), outputs=(LEAKAGE,)),
     "replay": Stage(
         work=replay,
@@ -371,18 +371,18 @@ STAGES = {
         inputs=(INPUTS, *_OUTCOME, *_RECORDS),
         outputs=(MANIFEST, STATISTICS, COUNTS),
     ),
-    "validate": Stage(work=validate, memory=finished.validate_memory, unchanged=date_validation),
+    "validate": Stage(work=validate, record=finished.validate_record, unchanged=date_validation),
     "recipe": Stage(
         work=write_recipe, settings=("export", "finetune"), inputs=(MANIFEST, *_RECORDS), outputs=(FINETUNE,)
     ),
-    "summary": Stage(work=summarize, memory=finished.summary_memory, unchanged=print_counts),
+    "summary": Stage(work=summarize, record=finished.summary_record, unchanged=print_counts),
     "card": Stage(
         work=write_card,
         settings=inputs.PUBLISHED,
         inputs=(MANIFEST, *REPORTS, *_RECORDS, FINETUNE, SHEETS),
         outputs=(CARD,),
     ),
-    "report": Stage(work=write_report, memory=finished.report_memory, unchanged=name_report),
+    "report": Stage(work=write_report, record=finished.report_record, unchanged=name_report),
 }
 """Name to stage, in the order in which they run; ``stages/exports.py`` performs all stages ``export_<group>``."""
 
@@ -413,8 +413,8 @@ def perform(name: str, run: Run, title: str = "") -> None:
         PipelineError: when the stage stops.
     """
     # A file that changes while the stage works must count as changed at the next call.
-    stage, memory = STAGES[name], _memory(name, run)
-    reason = _reason(stage, memory, run)
+    stage, record = STAGES[name], _record(name, run)
+    reason = _reason(stage, record, run)
     if reason is None:
         print(f"{title or name}: up to date", flush=True)
         if stage.unchanged is not None:
@@ -425,31 +425,31 @@ def perform(name: str, run: Run, title: str = "") -> None:
         print(f"  reason: {reason}", flush=True)
     reject_foreign_files(run.folder)
     stage.work(run)
-    if memory is not None:
-        memory.keep()
+    if record is not None:
+        record.write()
 
 
-def why_not(name: str, run: Run) -> str | None:
+def reason_to_run(name: str, run: Run) -> str | None:
     """Describe why a stage has to work; `None` if its outputs are up to date."""
-    return _reason(STAGES[name], _memory(name, run), run)
+    return _reason(STAGES[name], _record(name, run), run)
 
 
-def _reason(stage: Stage, memory: Memory | None, run: Run) -> str | None:
-    """Describe why a stage with this memory has to work; `None` if its outputs are up to date."""
-    reason = EVERY_TIME if memory is None else memory.why_not()
+def _reason(stage: Stage, record: StageRecord | None, run: Run) -> str | None:
+    """Describe why a stage with this record has to work; `None` if its outputs are up to date."""
+    reason = EVERY_TIME if record is None else record.reason_to_run()
     if reason is not None or stage.changed_file is None:
         return reason
     file = stage.changed_file(run)
     return None if file is None else finished.missing_or_changed(file, run.folder)
 
 
-def _memory(name: str, run: Run) -> Memory | None:
-    """Return the memory of the stage's last call, `None` for a stage that runs every time."""
+def _record(name: str, run: Run) -> StageRecord | None:
+    """Return the record of the stage's last call, `None` for a stage that runs every time."""
     stage = STAGES[name]
-    if stage.memory is not None:
-        return stage.memory(run)
+    if stage.record is not None:
+        return stage.record(run)
     if not stage.outputs:
         return None
     settings = inputs.settings(run.config)
     chosen = {section: settings[section] for section in stage.settings}
-    return finished.stage_memory(run, name, chosen, stage.inputs, stage.outputs)
+    return finished.stage_record(run, name, chosen, stage.inputs, stage.outputs)

@@ -19,7 +19,7 @@ from pipeline.run import cleaning, counts, dataset_basis, dataset_files, dropped
 from pipeline.run.outcome import RENDERINGS, REPLAYS, join_kinds, outdated
 from pipeline.run.progress import Progress
 from pipeline.run.run import Run
-from pipeline.stages import STAGES, why_not
+from pipeline.stages import STAGES, reason_to_run
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
 
 EXPORTS = frozenset(f"export_{group}" for group in GROUPS)
@@ -113,7 +113,7 @@ def _reasons_to_run(run: Run, progress: Progress) -> dict[str, str]:
     if not progress.rows:
         return dict.fromkeys(STAGES, NO_PLAN)
     reasons: dict[str, str] = {}
-    why_planned = why_not("plan", run)
+    why_planned = reason_to_run("plan", run)
     if why_planned is not None:
         reasons["plan"] = why_planned
     generated_again = outdated(progress.rows, run.trajectories, run.frames)
@@ -152,7 +152,7 @@ def _other_reasons_to_run(run: Run) -> dict[str, str]:
 
 def _reason_to_run(name: str, run: Run) -> str | None:
     """Return the reason why a stage would run, or would stop because of edits; `None` if its outputs are up to date."""
-    reason = why_not(name, run)
+    reason = reason_to_run(name, run)
     if reason is None:
         return None
     edited = any(edits(run.path(folder)) for folder in FOLDERS if folder in STAGES[name].outputs)
@@ -162,7 +162,7 @@ def _reason_to_run(name: str, run: Run) -> str | None:
 def _stale_datasets(run: Run) -> dict[str, str]:
     """Map the stages ``export_<group>`` that would write a dataset again to the reasons."""
     reasons: dict[str, list[str]] = {}
-    for dataset in (*run.formats, *(run.failure_formats if run.outcome.failures else ())):
+    for dataset in (*run.datasets, *(run.failure_datasets if run.outcome.failures else ())):
         episodes = dataset_basis.episodes_of(dataset, run)
         changed_file = dataset_files.changed_file(dataset)
         if changed_file is not None:

@@ -42,14 +42,14 @@ def test_a_step_states_the_versions_of_its_packages() -> None:
 def test_another_quality_and_another_shape_of_frames_are_other_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def made_by(jpeg_quality: int = 95) -> str:
-        return FrameStore(tmp_path, RenderConfig(jpeg_quality=jpeg_quality)).made_by
+    def fingerprint(jpeg_quality: int = 95) -> str:
+        return FrameStore(tmp_path, RenderConfig(jpeg_quality=jpeg_quality)).fingerprint
 
-    today = made_by()
-    assert made_by(80) != today
+    today = fingerprint()
+    assert fingerprint(80) != today
     smaller = SCHEMA.frame.model_copy(update={"shape": (128, 128, 3)})
     monkeypatch.setattr("pipeline.stores.frame_store.SCHEMA", SCHEMA.model_copy(update={"frame": smaller}))
-    assert made_by() != today
+    assert fingerprint() != today
 
 
 @pytest.mark.parametrize("value", ["", "0", "no"])

@@ -14,7 +14,7 @@ def test_the_same_basis_matches_also_after_a_round_through_json_and_in_another_o
     for requested in (REQUESTED, reordered, {**REQUESTED, "settings": {"seed": 1, "episodes": {"camera": 4}}}):
         basis = Basis.of(requested, dict(reversed(MADE_WITH.items())))
         assert RECORD.matches(basis)
-        assert RECORD.why_not(basis) is None
+        assert RECORD.describe_mismatch(basis) is None
     assert Basis.of({"axes": ("camera", "light")}, {}) == Basis.of({"axes": ["camera", "light"]}, {})
 
 
@@ -37,10 +37,10 @@ def test_the_same_basis_matches_also_after_a_round_through_json_and_in_another_o
 def test_what_differs_is_named(requested: object, made_with: dict[str, str], reason: str) -> None:
     basis = Basis.of(requested, made_with)
     assert not RECORD.matches(basis)
-    assert RECORD.why_not(basis) == reason
+    assert RECORD.describe_mismatch(basis) == reason
     assert RECORD.same_request(basis) == (requested == REQUESTED)
 
 
 def test_values_that_differ_between_tasks_can_be_left_out() -> None:
     basis = Basis.of(REQUESTED, {**MADE_WITH, "draws": "abc", "numpy": "2.3.0"})
-    assert RECORD.why_not(basis, unnamed=("draws",)) == "other draws, numpy 2.2.6, here 2.3.0"
+    assert RECORD.describe_mismatch(basis, unnamed=("draws",)) == "other draws, numpy 2.2.6, here 2.3.0"

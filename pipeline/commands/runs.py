@@ -45,7 +45,7 @@ def results(run: Run) -> dict[str, Path]:
     from pipeline.run.layout import CARD, FINETUNE, PREVIEWS, SHEETS
 
     return {
-        **{dataset.title: dataset.root for dataset in run.formats},
+        **{dataset.title: dataset.root for dataset in run.datasets},
         "manifest": run.manifest_file,
         "report": run.report_file,
         "fine-tuning": run.path(FINETUNE),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -40,31 +41,39 @@ TRIES = 2
 """Number of workers that end over an item before the item counts as the cause. It is then tried as often alone."""
 
 
-@dataclass(frozen=True)
-class Expendable(Generic[Item, Result]):
-    """A function whose items may be given up if no worker survives or finishes them.
+class Job(ABC, Generic[Result]):
+    """Item of work that may be given up if no worker survives or finishes it; ``run_job`` performs it."""
 
-    Attributes:
-        fn: the function.
-        limit_s: time after which an item counts as hanging, and its worker is ended; far above the time of any item.
-        lost: called in the run's own process for an item that was given up; its result replaces the item's result.
-        size: amount of work of an item, in the unit of the progress bar.
-    """
+    @abstractmethod
+    def __call__(self) -> Result:
+        """Perform the job in a worker."""
 
-    fn: Callable[[Item], Result]
-    limit_s: Callable[[Item], float]
-    lost: Callable[[Item], Result]
-    size: Callable[[Item], int] = lambda item: 1
+    @abstractmethod
+    def limit_s(self) -> float:
+        """Return the time after which the job counts as hanging, in s; its worker is then ended.
 
-    def __call__(self, item: Item) -> Result:
-        return self.fn(item)
+        The limit is far above the time of any job.
+        """
+
+    @abstractmethod
+    def lost(self) -> Result:
+        """Return the result of a job that was given up; called in the run's own process."""
+
+    def size(self) -> int:
+        """Return the amount of work, in the unit of the progress bar."""
+        return 1
+
+
+def run_job(job: Job[Result]) -> Result:
+    """Perform a job: the function that workers get together with jobs."""
+    return job()
 
 
 class Workers(Protocol):
     """Function that applies ``fn`` to every item, in any order and place, and returns results in the items' order.
 
     A worker that dies is replaced, and its item is repeated. An item over which workers die repeatedly ends the run,
-    unless ``fn`` is ``Expendable``.
+    unless it is a ``Job``.
     """
 
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]: ...
@@ -72,7 +81,7 @@ class Workers(Protocol):
 
 def loop(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
     """Run all items in this process, one after the other: for debugging and small jobs. A crash ends the run."""
-    sizes = _sizes(fn, items)
+    sizes = _sizes(items)
     with progress_of(description, sum(sizes)) as advance:
         results = []
         for item, size in zip(items, sizes, strict=True):
@@ -81,8 +90,8 @@ def loop(fn: Callable[[Item], Result], items: Sequence[Item], description: str) 
         return results
 
 
-def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
-    return [fn.size(item) if isinstance(fn, Expendable) else 1 for item in items]
+def _sizes(items: Sequence[object]) -> list[int]:
+    return [item.size() if isinstance(item, Job) else 1 for item in items]
 
 
 @contextmanager
@@ -98,19 +107,22 @@ def runner(compute_config: ComputeConfig, folder: Path, renders: bool = False) -
     if compute_config.cluster == "loop":
         yield loop
         return
-    with ExitStack() as opened:
-        workers: list[_Workers] = []
+    with ExitStack() as stack:
+        workers: _DaskWorkers | None = None
 
         def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
-            if items and not workers:
-                workers.append(opened.enter_context(_started(compute_config, folder, renders)))
-            return workers[0](fn, items, description) if items else []
+            nonlocal workers
+            if not items:
+                return []
+            if workers is None:
+                workers = stack.enter_context(_started(compute_config, folder, renders))
+            return workers(fn, items, description)
 
         yield run
 
 
 @contextmanager
-def _started(compute_config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Workers]:
+def _started(compute_config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_DaskWorkers]:
     import dask
     from distributed import Client
 
@@ -129,13 +141,13 @@ def _started(compute_config: ComputeConfig, folder: Path, renders: bool) -> Iter
     )
     if compute_config.cluster == "local":
         with local_cluster(compute_config.workers, renders) as (client, refill):
-            yield _Workers(client, refill=refill)
+            yield _DaskWorkers(client, refill=refill)
     elif compute_config.cluster == "slurm":
         with slurm_jobs(compute_config, folder) as jobs, Client(jobs.cluster) as client:
             jobs.wait_for_one(client)
             with workplace_of(client, folder) as workplace:
                 # Jobs may wait in the queue for hours.
-                yield _Workers(client, workplace, jobs.refill, patience_s=inf)
+                yield _DaskWorkers(client, workplace, jobs.refill, patience_s=inf)
     else:
         try:
             client = Client(compute_config.cluster, timeout=CONNECT_S)
@@ -146,12 +158,14 @@ def _started(compute_config: ComputeConfig, folder: Path, renders: bool) -> Iter
                 remedy="start a scheduler, or set compute.cluster: local",
             ) from error
         with client, workplace_of(client, folder) as workplace:
-            yield _Workers(client, workplace)
+            yield _DaskWorkers(client, workplace)
 
 
-def _limited(fn: Expendable[Item, Result], item: Item) -> Result:
-    """Call ``fn`` in a worker, and end the worker's process if the item takes too long, even within a library."""
-    faulthandler.dump_traceback_later(fn.limit_s(item), exit=True)
+def _call_with_limit(fn: Callable[[Item], Result], item: Item) -> Result:
+    """Call ``fn`` in a worker, and end the worker's process if a job takes too long, even within a library."""
+    if not isinstance(item, Job):
+        return fn(item)
+    faulthandler.dump_traceback_later(item.limit_s(), exit=True)
     try:
         return fn(item)
     finally:
@@ -159,7 +173,7 @@ def _limited(fn: Expendable[Item, Result], item: Item) -> Result:
 
 
 @dataclass(frozen=True)
-class _Workers:
+class _DaskWorkers:
     """Work on a client's workers.
 
     Attributes:
@@ -177,23 +191,25 @@ class _Workers:
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         from distributed import KilledWorker
 
-        limited = partial(_limited, fn) if isinstance(fn, Expendable) else fn
-        work = limited if self.workplace is None else partial(in_place, limited, self.workplace)
+        work: Callable[[Item], Result] = partial(_call_with_limit, fn)
+        if self.workplace is not None:
+            work = partial(in_place, work, self.workplace)
         results: dict[int, Result] = {}
-        deadly: list[int] = []
-        sizes = _sizes(fn, items)
+        killing_items: list[int] = []
+        sizes = _sizes(items)
         with progress_of(description, sum(sizes)) as advance, closing(self._outcomes(work, items)) as outcomes:
             for number, outcome in outcomes:
-                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
-                    deadly.append(number)
+                if isinstance(items[number], Job) and isinstance(outcome, KilledWorker):
+                    killing_items.append(number)
                     continue
                 results[number] = _result(outcome)
                 advance(sizes[number])
-            for number in deadly:
+            for number in killing_items:
+                item = items[number]
                 # Try it alone: another item may have ended the workers that had this item too.
-                ((_, outcome),) = self._outcomes(work, [items[number]])
-                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
-                    results[number] = fn.lost(items[number])
+                ((_, outcome),) = self._outcomes(work, [item])
+                if isinstance(item, Job) and isinstance(outcome, KilledWorker):
+                    results[number] = item.lost()
                 else:
                     results[number] = _result(outcome)
                 advance(sizes[number])
@@ -212,14 +228,14 @@ class _Workers:
         done: Queue[Future] = Queue()
         for future in futures:
             future.add_done_callback(done.put)
-        looked_s = time.monotonic()
+        last_check_s = time.monotonic()
         try:
             while numbers:
                 # While many workers work, items end all the time.
-                if time.monotonic() - looked_s >= LOOK_S:
+                if time.monotonic() - last_check_s >= LOOK_S:
                     self.refill()
-                    looked_s = time.monotonic()
-                future = self._next(done)
+                    last_check_s = time.monotonic()
+                future = self._wait_for_next(done)
                 if future.status == "error":
                     yield numbers.pop(future.key), future.exception()
                     continue
@@ -233,7 +249,7 @@ class _Workers:
                     yield numbers.pop(future.key), error
                     continue
                 except (CancelledError, CommClosedError, ConnectionError) as error:
-                    raise self._lost("the Dask scheduler no longer answers") from error
+                    raise self._scheduler_error("the Dask scheduler no longer answers") from error
                 # A worker that ends by itself would have to pass stored results on.
                 future.release()
                 yield numbers.pop(future.key), result
@@ -243,36 +259,39 @@ class _Workers:
                 with suppress(OSError):
                     self.client.cancel([future for future in futures if future.key in numbers])
 
-    def _next(self, done: Queue[Any]) -> Any:
+    def _wait_for_next(self, done: Queue[Any]) -> Any:
         """Return the next future that is done.
 
         Raises:
             PipelineError: when no worker is left.
         """
-        alone_s, last_came_s = 0, 0.0
+        without_workers_s, earlier_connected_s = 0, 0.0
         while True:
             try:
                 return done.get(timeout=LOOK_S)
             except Empty:
                 self.refill()
-                workers, came_s = self._there()
+                workers, last_connected_s = self._count_workers()
                 # A new worker may be starting, or may have connected and died over its work.
-                alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
-                last_came_s = came_s
-                if alone_s >= self.patience_s:
+                if workers or last_connected_s > earlier_connected_s:
+                    without_workers_s = 0
+                else:
+                    without_workers_s += LOOK_S
+                earlier_connected_s = last_connected_s
+                if without_workers_s >= self.patience_s:
                     what = f"no worker is left, and no new worker connected within {self.patience_s} s"
-                    raise self._lost(what) from None
+                    raise self._scheduler_error(what) from None
 
-    def _there(self) -> tuple[int, float]:
+    def _count_workers(self) -> tuple[int, float]:
         """Return the number of workers, and the time when the last worker connected, by the scheduler's clock."""
         try:
             events = self.client.get_events("all")
-            came_s = [stamp for stamp, event in events if event.get("action") == "add-worker"]
-            return len(self.client.nthreads()), max(came_s, default=0.0)
+            connected_s = [stamp for stamp, event in events if event.get("action") == "add-worker"]
+            return len(self.client.nthreads()), max(connected_s, default=0.0)
         except (OSError, TimeoutError):  # no scheduler
             return 0, 0.0
 
-    def _lost(self, what: str) -> PipelineError:
+    def _scheduler_error(self, what: str) -> PipelineError:
         remedy = f"start the scheduler and its workers again, and {GO_ON}"
         return PipelineError(what, where=self.client.scheduler.address, remedy=remedy)
 

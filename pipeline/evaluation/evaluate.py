@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline import gl, outputs
 from pipeline.axes import AXES
-from pipeline.compute.pool import LOST, Expendable, Workers
+from pipeline.compute.pool import LOST, Job, Workers, run_job
 from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
@@ -96,9 +96,8 @@ def _run_missing(
         warn_of_requests(policy.address, policy.timeout_s, settings.actions, settings.state_angle)
     device = gl.choose().device
     jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _divide_into_jobs(missing, workers)]
-    work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)
     faults: dict[EvaluationTask, str] = {}
-    for job_faults in run(work, jobs, "evaluate, episodes"):
+    for job_faults in run(run_job, jobs, "evaluate, episodes"):
         faults |= job_faults
     return faults
 
@@ -144,7 +143,7 @@ def _divide_into_jobs(missing: Sequence[EvaluationTask], workers: int) -> list[t
 
 
 @dataclass(frozen=True)
-class EvaluationJob:
+class EvaluationJob(Job[dict[EvaluationTask, str]]):
     """Job for a worker: episodes of one scene.
 
     Attributes:
@@ -193,7 +192,7 @@ class EvaluationJob:
                 _failures.clear()
         return faults
 
-    def episodes(self) -> int:
+    def size(self) -> int:
         """Return the number of episodes of the job."""
         return len(self.tasks)
 

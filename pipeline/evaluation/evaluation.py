@@ -105,7 +105,7 @@ class Evaluation:
         outdated: Counter[str] = Counter()
         for task in tasks:
             row = self.files.row(self.episode(task))
-            reason = None if row is None else _record(row).why_not(self.basis(task), PER_TASK)
+            reason = None if row is None else _record(row).describe_mismatch(self.basis(task), PER_TASK)
             if reason is not None:
                 outdated[f"episodes, generated with {reason}"] += 1
         identity.require_remake_permission(outdated, self.folder, REMAKE)

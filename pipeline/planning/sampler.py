@@ -30,9 +30,7 @@ class TakenEntries:
         self._times: Counter[str] = Counter()
 
     def order(self, entries: Sequence[str], key: str) -> list[int]:
-        """Return the indices of the entries in the order in which a candidate tries them; [0] for an empty list."""
-        if not entries:
-            return [0]
+        """Return the indices of the entries in the order in which a candidate tries them."""
 
         def rank(entry_index: int) -> tuple[int, str]:
             entry = entries[entry_index]
@@ -40,19 +38,18 @@ class TakenEntries:
 
         return sorted(range(len(entries)), key=rank)
 
-    def take(self, entries: Sequence[str], entry_index: int) -> None:
-        """Count the entry at ``entry_index`` as taken by a candidate."""
-        if entries:
-            self._times[entries[entry_index]] += 1
+    def take(self, entry: str) -> None:
+        """Count an entry as taken by a candidate."""
+        self._times[entry] += 1
 
 
-class _Choice(NamedTuple):
+class _FirstSample(NamedTuple):
     """First sample of an axis.
 
     Attributes:
         task: the task that the axis perturbs, which an earlier axis may have carried to another scene.
         earlier: perturbations that the episode's start has from an expansion; none if the episode starts from a reset.
-        entry_index: index into the axis's ``entries``.
+        entry_index: index into the axis's ``entries``; 0 if the axis has none.
     """
 
     axis: Axis
@@ -65,6 +62,13 @@ class _Choice(NamedTuple):
 @dataclass(frozen=True)
 class Sampler:
     """Source of perturbations for a plan's episodes of one axis or combination.
+
+    A *candidate* is a demonstration's id and the number of a variant. Each random choice has a key, which begins with
+    ``seed`` and ``name``:
+
+    * ``(seed, name, demo_id, variant)``: order of the list entries that a candidate tries;
+    * ``(seed, name, demo_id, variant, attempt)``: first samples of all axes, from one generator;
+    * ``(seed, name, demo_id, variant, attempt, n)``: further samples of axis ``n``, counted from 0.
 
     Attributes:
         name: name of the axis or combination, as in ``plan.episodes``.
@@ -97,81 +101,97 @@ class Sampler:
         taken = taken or TakenEntries()
         contents: set[tuple[str, ...]] = set()
         for variant in count():
-            new = self._sample_new(task, taken, earlier, (demo_id, variant), contents)
-            if new is None:
+            sampled = self._sample_variant(task, taken, earlier, (demo_id, variant), contents)
+            if sampled is None:
                 return
-            choices, perturbations = new
+            first_samples, perturbations = sampled
             contents.add(_content_of(perturbations))
-            for choice in choices:
-                taken.take(choice.axis.entries(choice.task), choice.entry_index)
+            for first in first_samples:
+                entries = first.axis.entries(first.task)
+                if entries:
+                    taken.take(entries[first.entry_index])
             yield perturbations
 
-    def _sample_new(
+    def _sample_variant(
         self,
         task: Task,
         taken: TakenEntries,
         earlier: Sequence[Perturbation],
-        key: tuple[str | int, ...],
+        candidate: tuple[str, int],
         contents: Collection[tuple[str, ...]],
-    ) -> tuple[list[_Choice], tuple[Perturbation, ...]] | None:
+    ) -> tuple[list[_FirstSample], tuple[Perturbation, ...]] | None:
         """Sample one perturbation of each axis, different from those of all earlier variants.
 
         Args:
             contents: contents of the earlier variants, see ``_content_of``.
 
         Returns:
-            The choices and the perturbations; ``None`` if no attempt gives different perturbations that are clear.
+            The first samples and the perturbations; ``None`` if no attempt gives different perturbations that are
+            clear.
         """
         for attempt in range(_ATTEMPTS):
-            choices = self._sample_axes(task, attempt, taken, earlier, key)
-            perturbations = self._sample_all_clear(choices, (*key, attempt))
+            first_samples = self._sample_first(task, taken, earlier, candidate, attempt)
+            perturbations = self._keep_or_resample_all(first_samples, candidate, attempt)
             if perturbations and _content_of(perturbations) not in contents:
-                return choices, perturbations
+                return first_samples, perturbations
         return None
 
-    def _sample_axes(
-        self, task: Task, attempt: int, taken: TakenEntries, earlier: Sequence[Perturbation], key: tuple[str | int, ...]
-    ) -> list[_Choice]:
+    def _sample_first(
+        self,
+        task: Task,
+        taken: TakenEntries,
+        earlier: Sequence[Perturbation],
+        candidate: tuple[str, int],
+        attempt: int,
+    ) -> list[_FirstSample]:
         """Sample one perturbation of each axis, in the order in which they apply."""
-        # One generator samples all first perturbations. Each axis that samples again uses a generator of its own.
-        random = rng(self.seed, self.name, *key, attempt)
-        choices: list[_Choice] = []
+        random = rng(self.seed, self.name, *candidate, attempt)
+        samples: list[_FirstSample] = []
         for axis in self.axes:
-            indices = taken.order(axis.entries(task), digest(self.seed, self.name, *key))
-            entry_index = indices[attempt % len(indices)]
+            entries = axis.entries(task)
+            entry_index = 0
+            if entries:
+                order = taken.order(entries, digest(self.seed, self.name, *candidate))
+                entry_index = order[attempt % len(order)]
             perturbation = axis.sample_after(random, task, entry_index, earlier)
-            choices.append(_Choice(axis, task, earlier, entry_index, perturbation))
+            samples.append(_FirstSample(axis, task, earlier, entry_index, perturbation))
             task = perturbation.carry(task)
             if perturbation.reset_seed is not None:
                 earlier = ()
-        return choices
+        return samples
 
-    def _sample_all_clear(
-        self, choices: Sequence[_Choice], key: tuple[str | int, ...]
+    def _keep_or_resample_all(
+        self, first_samples: Sequence[_FirstSample], candidate: tuple[str, int], attempt: int
     ) -> tuple[Perturbation, ...] | None:
-        """Return one perturbation of each choice, or ``None`` if an axis has none that is clear."""
-        texts = [choice.perturbation for choice in choices]
-        instruction = " ".join(change.apply("") for change in texts if isinstance(change, TextPerturbation))
+        """Return one clear perturbation for each first sample, or ``None`` if an axis has none that is clear."""
+        sampled = [first.perturbation for first in first_samples]
+        instruction = " ".join(change.apply("") for change in sampled if isinstance(change, TextPerturbation))
         perturbations = []
-        for number, choice in enumerate(choices):
-            clear = self._sample_clear(choice, instruction, (*key, number))
+        for number, first in enumerate(first_samples):
+            key = (*candidate, attempt, number)
+            clear = self._keep_or_resample(first, instruction, key)
             if clear is None:
                 return None
             perturbations.append(clear)
         return tuple(perturbations)
 
-    def _sample_clear(self, choice: _Choice, instruction: str, key: tuple[str | int, ...]) -> Perturbation | None:
-        """Return the chosen perturbation if it is clear, else sample a clear one of its component and level.
+    def _keep_or_resample(
+        self, first_sample: _FirstSample, instruction: str, key: tuple[str | int, ...]
+    ) -> Perturbation | None:
+        """Return the first sample if it is clear, else sample a clear perturbation of its component and level.
 
         A clear perturbation keeps its clearance to the test set, unless the axis keeps none, and the ``instruction``
         does not name it. Component and level are kept because strengths near the test set's would otherwise become
         rare.
 
+        Args:
+            key: key of further samples, without ``seed`` and ``name``.
+
         Returns:
             The perturbation. ``None`` if many attempts give no clear one, or if the axis takes the entries of a list:
             the caller then tries the next entry.
         """
-        axis, task, first = choice.axis, choice.task, choice.perturbation
+        axis, task, first = first_sample.axis, first_sample.task, first_sample.perturbation
 
         def is_clear(perturbation: Perturbation) -> bool:
             if perturbation.named_in(instruction):
@@ -186,7 +206,7 @@ class Sampler:
         random = rng(self.seed, self.name, *key)
         axis_at_level = axis.model_copy(update={"levels": (first.level,)})
         for _ in range(_ATTEMPTS):
-            perturbation = axis_at_level.sample_after(random, task, 0, choice.earlier)
+            perturbation = axis_at_level.sample_after(random, task, 0, first_sample.earlier)
             is_alike = (perturbation.component, perturbation.level) == (first.component, first.level)
             if is_alike and is_clear(perturbation):
                 return perturbation

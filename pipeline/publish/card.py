@@ -49,7 +49,7 @@ def write(run: Run) -> None:
     Raises:
         PipelineError: when a file that the card describes cannot be read, or edits of the card would be lost.
     """
-    rows, formats = run.manifest, run.formats
+    rows, formats = run.manifest, run.datasets
     settings = manifest.settings(run.manifest_file)
     reports = {name: read_json(run.path(name)) for name in REPORTS}
     kept = [row for row in rows if row["kept"]]

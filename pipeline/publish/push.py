@@ -300,7 +300,7 @@ def _reject_other_settings(run: Run) -> None:
     """Raise an error if the configuration has changed since the card, the last output of a run, was generated."""
     record = read_record(run.path(CARD))
     files = record.basis.requested["files"]
-    changed = record.why_not(Basis.of({"files": files, "settings": published_settings(run.config)}, {}))
+    changed = record.describe_mismatch(Basis.of({"files": files, "settings": published_settings(run.config)}, {}))
     if changed:
         raise PipelineError(
             f"the card and the dataset are of another configuration: {changed}",

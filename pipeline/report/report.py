@@ -60,7 +60,7 @@ def page(run: Run, test: TestSet) -> str:
         PipelineError: when the run's folder lacks an output of an earlier stage.
     """
     rows, config = run.manifest, run.config
-    load = run.episodes()
+    load = run.episode_loader()
     tried = counts.tried(rows)
     kept = [row for row in tried if row["kept"]]
     distances = leakage.covered_by(kept, read_json(run.path(LEAKAGE)), test)

@@ -140,7 +140,7 @@ class _Seen:
 
     def __init__(self, run: Run, twins: Mapping[str, Row]):
         self.trajectories = run.trajectories
-        self.load = run.episodes()
+        self.load = run.episode_loader()
         self._twins = twins
         self._looks: dict[tuple[str, int], Look] = {}
 

@@ -75,7 +75,7 @@ PARTS = {
 
 def say_stale(part: str, run: Run) -> None:
     """Print the datasets of a part of ``PARTS`` that exist although the configuration does not request them."""
-    asked = {dataset.folder for dataset in (*run.formats, *run.failure_formats)}
+    asked = {dataset.folder for dataset in (*run.datasets, *run.failure_datasets)}
     for folder in map(run.path, PARTS[part].names):
         if folder.is_dir() and folder not in asked:
             print(

@@ -17,13 +17,13 @@ from pipeline.run.run import Run
 from pipeline.seeding import digest
 
 
-def episodes_of(target: AnyFormat, run: Run) -> Episodes:
+def episodes_of(dataset: AnyFormat, run: Run) -> Episodes:
     """Return the episodes of a dataset in the order they are written: the kept episodes of a run, or its failures.
 
     Each episode has all rewrites that the run's language axis may sample for it. Without this axis, its default ranges
     decide.
     """
-    failures = target.content.is_of_failures
+    failures = dataset.content.is_of_failures
     rewrites: dict[str, tuple[str, ...]] = {}
     outcome, language = run.outcome, run.config.plan.axes.language
     facts: dict[str, EpisodeFacts] = {}
@@ -40,50 +40,50 @@ def episodes_of(target: AnyFormat, run: Run) -> Episodes:
             origin=row.demo_origin_sha256,
             scene=task.bddl_file.stem if task.goal_file else "",
         )
-    load = run.episodes(failures=failures, rewrites=rewrites, replays=target.stores_replay)
+    load = run.episode_loader(failures=failures, rewrites=rewrites, replays=dataset.stores_replay)
     return Episodes(facts, load)
 
 
-def compute_basis(target: AnyFormat, episodes: Episodes) -> Basis:
+def compute_basis(dataset: AnyFormat, episodes: Episodes) -> Basis:
     """Return everything that the bytes of a dataset depend on. Its request consists of episodes and options."""
     contents = [episode.content for episode in episodes.facts.values()]
     identity = digest(
         "export",
-        target.name,
-        target.recipe,
-        {package: version(package) for package in target.packages},
+        dataset.name,
+        dataset.recipe,
+        {package: version(package) for package in dataset.packages},
         SCHEMA.model_dump(mode="json"),
-        _options(target),
-        *target.content.stated(),
-        [[piece.path, piece.ids] for piece in target.pieces(episodes)],
+        _options(dataset),
+        *dataset.content.stated(),
+        [[piece.path, piece.ids] for piece in dataset.pieces(episodes)],
         contents,
     )
-    requested = digest(_options(target), *target.content.stated(), contents)[:16]
+    requested = digest(_options(dataset), *dataset.content.stated(), contents)[:16]
     schema = digest(SCHEMA.model_dump(mode="json"))[:8]
-    return Basis(identity[:16], requested, {**target.made_with(), "episode schema": schema})
+    return Basis(identity[:16], requested, {**dataset.made_with(), "episode schema": schema})
 
 
-def _options(target: AnyFormat) -> dict[str, Any]:
+def _options(dataset: AnyFormat) -> dict[str, Any]:
     """Return a format's options under the field names of the first version that wrote them."""
-    dumped: dict[str, Any] = target.options.model_dump(mode="json", by_alias=True)
+    dumped: dict[str, Any] = dataset.options.model_dump(mode="json", by_alias=True)
     return dumped
 
 
-def is_up_to_date(target: AnyFormat, episodes: Episodes) -> bool:
+def is_up_to_date(dataset: AnyFormat, episodes: Episodes) -> bool:
     """Return whether the dataset exists, is complete and has these episodes.
 
     Every file must exist and be no younger than the record.
     """
-    return is_unchanged(target) and target.record().matches(compute_basis(target, episodes))
+    return is_unchanged(dataset) and dataset.record().matches(compute_basis(dataset, episodes))
 
 
-def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
+def outdated(dataset: AnyFormat, episodes: Episodes) -> Counter[str]:
     """Count, by reason, the files of a finished dataset that would be generated again although the request is equal."""
     try:
-        record = target.record()
+        record = dataset.record()
     except PipelineError:
         return Counter()
-    basis = compute_basis(target, episodes)
+    basis = compute_basis(dataset, episodes)
     if record.matches(basis) or not record.same_request(basis):
         return Counter()
-    return Counter({f"files, generated with {record.why_not(basis)}": len(record.files)})
+    return Counter({f"files, generated with {record.describe_mismatch(basis)}": len(record.files)})

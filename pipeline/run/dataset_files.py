@@ -29,9 +29,9 @@ The record shows which files in the dataset's folder are foreign.
 """
 
 
-def put_away_record(target: AnyFormat) -> Path:
+def put_away_record(dataset: AnyFormat) -> Path:
     """Return the file of the record of a dataset with missing or edited files; it need not exist."""
-    return target.work / PUT_AWAY / RECORD_FILE
+    return dataset.work / PUT_AWAY / RECORD_FILE
 
 
 def list_put_away_records(work: Path) -> set[Path]:
@@ -56,24 +56,24 @@ def list_records_of_moved_datasets(work: Path) -> list[Path]:
     return [file for file in work.glob(f"*/{RECORD_FILE}") if not (file.parent / "dataset").is_dir()]
 
 
-def is_unchanged(target: AnyFormat) -> bool:
+def is_unchanged(dataset: AnyFormat) -> bool:
     """Return whether a finished dataset has no missing file, and none that was edited, by its size and time."""
-    return changed_file(target) is None
+    return changed_file(dataset) is None
 
 
-def changed_file(target: AnyFormat) -> Path | None:
+def changed_file(dataset: AnyFormat) -> Path | None:
     """Return a file of a finished dataset that is missing, or was edited since it was recorded, by its size and time.
 
     Returns:
         The first such file; the record if it is missing or unreadable; `None` if all files are unchanged.
     """
     try:
-        recorded = target.record_file.stat().st_mtime_ns
-        record = target.record()
+        recorded = dataset.record_file.stat().st_mtime_ns
+        record = dataset.record()
     except (PipelineError, OSError):
-        return target.record_file
+        return dataset.record_file
     for name in record.files:
-        file = target.folder / name
+        file = dataset.folder / name
         try:
             found = file.stat()
         except OSError:
@@ -84,30 +84,39 @@ def changed_file(target: AnyFormat) -> Path | None:
     return None
 
 
-def foreign_files(target: AnyFormat) -> list[Path]:
+def first_changed_file(datasets: Sequence[AnyFormat]) -> Path | None:
+    """Return the ``changed_file`` of the first dataset that has one; `None` if all datasets are unchanged."""
+    for dataset in datasets:
+        file = changed_file(dataset)
+        if file is not None:
+            return file
+    return None
+
+
+def foreign_files(dataset: AnyFormat) -> list[Path]:
     """List the foreign files in the folder of a finished dataset.
 
     Raises:
         PipelineError: when there is no record, or it cannot be read.
     """
-    return _list_foreign(target.folder, target.record().files.keys())
+    return _list_foreign(dataset.folder, dataset.record().files.keys())
 
 
-def reject_foreign(target: AnyFormat, episodes: Episodes) -> None:
+def reject_foreign(dataset: AnyFormat, episodes: Episodes) -> None:
     """Stop if the format's folder has foreign entries, as a dataset is replaced as a whole.
 
     Raises:
         PipelineError: when an entry is no set of the stored dataset or of the dataset to write, or when a set has a
             foreign file.
     """
-    sets = target.sets(target.pieces(episodes)) if episodes.ids else set()
-    recorded = _recorded_paths(target)
+    sets = dataset.sets(dataset.pieces(episodes)) if episodes.ids else set()
+    recorded = _recorded_paths(dataset)
     sets |= {name.partition("/")[0] for name in recorded}
-    foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in sets)
+    foreign = sorted(entry for entry in dataset.folder.glob("*") if entry.name not in sets)
     if recorded and not foreign:
-        foreign = _list_foreign(target.folder, recorded)
+        foreign = _list_foreign(dataset.folder, recorded)
     if foreign:
-        raise _foreign_error(target, foreign, sets)
+        raise _foreign_error(dataset, foreign, sets)
 
 
 def reject_deleting_foreign(folder: Path) -> None:
@@ -135,7 +144,7 @@ def reject_deleting_foreign(folder: Path) -> None:
         )
 
 
-def foreign_to_move(target: AnyFormat, new: DatasetRecord) -> list[Path]:
+def foreign_to_move(dataset: AnyFormat, new: DatasetRecord) -> list[Path]:
     """List the foreign files that a new dataset replaces by files of the same names, with other content.
 
     Such a file is the user's, or of a dataset whose record was deleted.
@@ -147,37 +156,37 @@ def foreign_to_move(target: AnyFormat, new: DatasetRecord) -> list[Path]:
         PipelineError: naming such a file, unless ``REMAKE=1`` allows the replacement; or naming a foreign file whose
             name the new dataset does not have.
     """
-    recorded = _recorded_paths(target)
+    recorded = _recorded_paths(dataset)
     in_the_way: list[Path] = []
     to_move: list[Path] = []
-    for file in _list_foreign(target.folder, recorded):
-        sha256 = new.files.get(file.relative_to(target.folder).as_posix())
+    for file in _list_foreign(dataset.folder, recorded):
+        sha256 = new.files.get(file.relative_to(dataset.folder).as_posix())
         if sha256 is None:
             in_the_way.append(file)
         elif not file.is_file() or checksum(file) != sha256:
             to_move.append(file)
     if in_the_way:
-        raise _foreign_error(target, in_the_way, {name.partition("/")[0] for name in (*recorded, *new.files)})
+        raise _foreign_error(dataset, in_the_way, {name.partition("/")[0] for name in (*recorded, *new.files)})
     if to_move and not remake_allowed():
         raise PipelineError(
             f"no record of an export lists the file, and it would be replaced ({len(to_move)} such files)",
             where=to_move[0],
-            expected=f"only files that {target.record_file} lists",
+            expected=f"only files that {dataset.record_file} lists",
             remedy=f"move it to another place, and run the command again; or let the export move it: {ALLOW}",
         )
     return to_move
 
 
-def reject_edited(target: AnyFormat) -> None:
+def reject_edited(dataset: AnyFormat) -> None:
     """Stop before an edited file of a dataset whose record was put away is replaced; a missing file is written again.
 
     Raises:
         PipelineError: naming the file, unless ``REMAKE=1`` allows the replacement.
     """
-    edited_to_move(target, put_away_record(target))
+    edited_to_move(dataset, put_away_record(dataset))
 
 
-def edited_to_move(target: AnyFormat, record_file: Path) -> list[Path]:
+def edited_to_move(dataset: AnyFormat, record_file: Path) -> list[Path]:
     """List the edited files of a dataset that is about to be replaced, by their checksums.
 
     Args:
@@ -191,7 +200,7 @@ def edited_to_move(target: AnyFormat, record_file: Path) -> list[Path]:
     recorded = DatasetRecord.from_json(read_json(record_file)).files
     edited: list[Path] = []
     for name, sha256 in recorded.items():
-        file = target.folder / name
+        file = dataset.folder / name
         if file.is_file() and checksum(file) != sha256:
             edited.append(file)
     if edited and not remake_allowed():
@@ -204,13 +213,13 @@ def edited_to_move(target: AnyFormat, record_file: Path) -> list[Path]:
     return edited
 
 
-def _recorded_paths(target: AnyFormat) -> set[str]:
+def _recorded_paths(dataset: AnyFormat) -> set[str]:
     """Return the paths of the files that exports have put into a dataset's folder: empty without any record."""
     recorded: set[str] = set()
-    for file in list_records_of_moved_datasets(target.work):
+    for file in list_records_of_moved_datasets(dataset.work):
         recorded |= DatasetRecord.from_json(read_json(file)).files.keys()
     with suppress(PipelineError):  # The dataset has no record, or has changed since.
-        recorded |= target.record().files.keys()
+        recorded |= dataset.record().files.keys()
     return recorded
 
 
@@ -228,11 +237,11 @@ def _list_foreign(folder: Path, recorded: Collection[str]) -> list[Path]:
     return foreign
 
 
-def _foreign_error(target: AnyFormat, foreign: Sequence[Path], sets: Collection[str]) -> PipelineError:
+def _foreign_error(dataset: AnyFormat, foreign: Sequence[Path], sets: Collection[str]) -> PipelineError:
     """Return the error about foreign entries of a dataset's folder."""
     return PipelineError(
-        f"the entry is not of this run's {target.title} and would be deleted ({len(foreign)} such entries)",
+        f"the entry is not of this run's {dataset.title} and would be deleted ({len(foreign)} such entries)",
         where=foreign[0],
         expected=f"only {', '.join(sorted(sets))}",
-        remedy=f"move it out of {target.folder}; to train on both, create a folder of links to both",
+        remedy=f"move it out of {dataset.folder}; to train on both, create a folder of links to both",
     )

@@ -144,9 +144,9 @@ def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str
 def _exported(run: Run) -> set[str]:
     """Return the ids of the episodes in the finished datasets that the run would replace."""
     exported: set[str] = set()
-    for target in (*run.formats, *run.failure_formats):
+    for dataset in (*run.datasets, *run.failure_datasets):
         with suppress(PipelineError):  # The dataset has no record.
-            exported |= target.record().places.keys()
+            exported |= dataset.record().places.keys()
     return exported
 
 

@@ -1,12 +1,11 @@
-"""Memory of stages with few outputs: skip a stage if its inputs and recipe have not changed since its last call.
+"""Records of stages with few outputs: skip a stage if its inputs and recipe have not changed since its last call.
 
-The memory of a stage is the file ``data/<run>/.finished/<stage>.json``. A stage works again if one of its outputs is
+The record of a stage is the file ``data/<run>/.finished/<stage>.json``. A stage works again if one of its outputs is
 deleted; for a dataset, delete its record, too.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import chain
 from pathlib import Path
 
 from pipeline.axes.language import BANK_FILE
@@ -16,7 +15,7 @@ from pipeline.files import checksum, read_json, write_json
 from pipeline.formats.registry import FORMATS
 from pipeline.identity import LIBRARY, RECIPES, Step, digest_library, made_with, versions
 from pipeline.record import Basis, Record
-from pipeline.run.dataset_files import changed_file
+from pipeline.run.dataset_files import first_changed_file
 from pipeline.run.inputs import settings_of
 from pipeline.run.layout import (
     COUNTS,
@@ -47,8 +46,8 @@ NO_RECORD = "no record of an earlier call"
 
 
 @dataclass(frozen=True)
-class Memory:
-    """Place of the record of a stage's outputs.
+class StageRecord:
+    """Record of a stage's outputs in the run's folder, and the basis that the outputs have if the stage works now.
 
     Attributes:
         data: folder of the run.
@@ -64,11 +63,11 @@ class Memory:
     outputs: Sequence[str]
     fault: str = ""
 
-    def holds(self) -> bool:
+    def is_up_to_date(self) -> bool:
         """Return whether the outputs are unchanged, and were generated from the same inputs by the same recipe."""
-        return self.why_not() is None
+        return self.reason_to_run() is None
 
-    def why_not(self) -> str | None:
+    def reason_to_run(self) -> str | None:
         """Describe why the stage has to work; `None` if the outputs are up to date."""
         if self.basis is None:
             return self.fault
@@ -80,10 +79,10 @@ class Memory:
         if record.matches(self.basis) and record.files != outputs:
             changed = sorted(name for name, _ in record.files.items() ^ outputs.items())
             return missing_or_changed(self.data / changed[0], self.data)
-        return record.why_not(self.basis)
+        return record.describe_mismatch(self.basis)
 
-    def keep(self) -> None:
-        """Record the present outputs."""
+    def write(self) -> None:
+        """Write the record of the present outputs, with the basis from before the stage worked."""
         self._file.unlink(missing_ok=True)
         if self.basis is not None:
             write_json(self._file, asdict(Record(self.basis, self._contents())))
@@ -97,7 +96,7 @@ class Memory:
         return Record(Basis(**content["basis"]), dict(content["files"]))
 
     def _contents(self) -> Mapping[str, str]:
-        return _contents([self.data / name for name in self.outputs], self.data)
+        return _contents(self.outputs, self.data)
 
 
 def missing_or_changed(file: Path, data: Path) -> str:
@@ -105,10 +104,10 @@ def missing_or_changed(file: Path, data: Path) -> str:
     return f"{file.relative_to(data).as_posix()} {'has changed' if file.exists() else 'is missing'}"
 
 
-def stage_memory(
+def stage_record(
     run: Run, name: str, settings: Mapping[str, object], inputs: Sequence[str], outputs: Sequence[str]
-) -> Memory:
-    """Return the memory of a stage whose outputs depend on this library, its settings and its input files.
+) -> StageRecord:
+    """Return the record of a stage whose outputs depend on this library, its settings and its input files.
 
     Args:
         settings: JSON-serialisable.
@@ -124,80 +123,103 @@ def stage_memory(
             made_with_all.update(kind.made_with())
     except PipelineError:
         # The stage `doctor` reports the fault.
-        return Memory(run.folder, name, None, outputs, "a package is missing, or another copy of it is imported")
+        return StageRecord(run.folder, name, None, outputs, "a package is missing, or another copy of it is imported")
     made_with_all["code"] = digest_library()[:16]
-    contents = _contents([run.path(file) for file in inputs], run.folder)
-    basis = Basis.of({"settings": dict(settings), "files": contents}, made_with_all)
-    return Memory(run.folder, name, basis, outputs)
+    basis = Basis.of({"settings": dict(settings), "files": _contents(inputs, run.folder)}, made_with_all)
+    return StageRecord(run.folder, name, basis, outputs)
 
 
-def validate_memory(run: Run) -> Memory:
-    """Return the memory of ``validate``, which passed on the recorded contents."""
-    stores, formats = (run.trajectories, run.frames), run.recorded_formats
-    files = [run.path(name) for name in (PLAN, MANIFEST, COUNTS, STATISTICS, INPUTS)]
-    files += [store.root / TABLE for store in stores]
-    files += [dataset.record_file for dataset in formats]
-    changes = chain((store.changed_file() for store in stores), map(changed_file, formats))
-    changed = next(filter(None, changes), None)
-    config = run.config
-    settings = {
-        "render": settings_of(config.render),
-        "export": settings_of(config.export),
-        "axes": settings_of(config.plan.axes),
-        "bank of rewrites": checksum(BANK_FILE),
-    }
-    requested = {"settings": settings, "files": _contents(files, run.folder)}
-    return _memory(run, "validate", [VALIDATION], requested, "checks", changed)
+def validate_record(run: Run) -> StageRecord:
+    """Return the record of ``validate``, which passed on the recorded contents."""
+    config, datasets = run.config, run.recorded_datasets
+    records = [dataset.record_file.relative_to(run.folder).as_posix() for dataset in datasets]
+    return _record_of(
+        run,
+        "validate",
+        "checks",
+        changed_file=run.trajectories.changed_file() or run.frames.changed_file() or first_changed_file(datasets),
+        settings={
+            "render": settings_of(config.render),
+            "export": settings_of(config.export),
+            "axes": settings_of(config.plan.axes),
+            "bank of rewrites": checksum(BANK_FILE),
+        },
+        inputs=[PLAN, MANIFEST, COUNTS, STATISTICS, INPUTS, TRAJECTORIES_TABLE, FRAMES_TABLE, *records],
+        outputs=[VALIDATION],
+    )
 
 
-def trial_memory(run: Run, device: str) -> Memory:
-    """Return the memory of a trial of this machine."""
+def trial_record(run: Run, device: str) -> StageRecord:
+    """Return the record of a trial of this machine."""
     basis = Basis.of({"host": host()}, {**made_with("pixels"), "OpenGL device": device})
-    return Memory(run.folder, "trial", basis, [MACHINE])
+    return StageRecord(run.folder, "trial", basis, [MACHINE])
 
 
-def summary_memory(run: Run) -> Memory:
-    """Return the memory of the contact sheets and previews."""
-    names = (PLAN, MANIFEST, INPUTS, FRAMES_TABLE)
-    return _pictures_memory(run, "summary", [SHEETS, PREVIEWS], _settings_of_pictures(run.config), names)
+def summary_record(run: Run) -> StageRecord:
+    """Return the record of the contact sheets and previews."""
+    return _record_of(
+        run,
+        "summary",
+        "pictures",
+        changed_file=run.frames.changed_file(),
+        settings=_settings_of_pictures(run.config),
+        inputs=[PLAN, MANIFEST, INPUTS, FRAMES_TABLE],
+        outputs=[SHEETS, PREVIEWS],
+    )
 
 
-def previews_memory(run: Run) -> Memory:
-    """Return the memory of the previews, which show no episode and do not depend on kept or exported episodes."""
-    return _pictures_memory(run, "previews", [PREVIEWS], _settings_of_pictures(run.config), [INPUTS])
+def previews_record(run: Run) -> StageRecord:
+    """Return the record of the previews, which show no episode and do not depend on kept or exported episodes."""
+    return _record_of(
+        run,
+        "previews",
+        "pictures",
+        changed_file=None,
+        settings=_settings_of_pictures(run.config),
+        inputs=[INPUTS],
+        outputs=[PREVIEWS],
+    )
 
 
-def report_memory(run: Run) -> Memory:
-    """Return the memory of the report."""
-    names = (PLAN, MANIFEST, LEAKAGE, INPUTS, FRAMES_TABLE, SHEETS, PREVIEWS)
-    settings = {
-        **settings_of(run.config, {"compute", "folder", "publish"}),
-        "measures of the test tasks": checksum(SEEN),
-    }
-    return _pictures_memory(run, "report", [REPORT], settings, names)
+def report_record(run: Run) -> StageRecord:
+    """Return the record of the report."""
+    return _record_of(
+        run,
+        "report",
+        "pictures",
+        changed_file=run.frames.changed_file(),
+        settings={
+            **settings_of(run.config, {"compute", "folder", "publish"}),
+            "measures of the test tasks": checksum(SEEN),
+        },
+        inputs=[PLAN, MANIFEST, LEAKAGE, INPUTS, FRAMES_TABLE, SHEETS, PREVIEWS],
+        outputs=[REPORT],
+    )
 
 
-def _pictures_memory(
-    run: Run, stage: str, outputs: Sequence[str], settings: Mapping[str, object], names: Sequence[str]
-) -> Memory:
-    changed = run.frames.changed_file() if FRAMES_TABLE in names else None
-    requested = {"settings": settings, "files": _contents([run.path(name) for name in names], run.folder)}
-    return _memory(run, stage, outputs, requested, "pictures", changed)
-
-
-def _memory(
-    run: Run, stage: str, outputs: Sequence[str], requested: object, step: Step, changed: Path | None
-) -> Memory:
-    """Return a memory that does not hold if a stored file was changed or deleted.
+def _record_of(
+    run: Run,
+    stage: str,
+    step: Step,
+    *,
+    changed_file: Path | None,
+    settings: Mapping[str, object],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+) -> StageRecord:
+    """Return the record of a stage whose outputs depend on one step, its settings and its input files.
 
     Args:
-        requested: settings and input files that the outputs depend on, JSON-serialisable.
-        step: step of ``pipeline/identity.py`` that the outputs depend on.
-        changed: a stored file that was changed or deleted.
+        step: step of ``pipeline/identity.py``.
+        changed_file: a stored file that was changed or deleted; the outputs are then not up to date.
+        settings: JSON-serialisable.
+        inputs: files and folders of the run.
+        outputs: files and folders of the run.
     """
-    if changed is not None:
-        return Memory(run.folder, stage, None, outputs, missing_or_changed(changed, run.folder))
-    return Memory(run.folder, stage, Basis.of(requested, made_with(step)), outputs)
+    if changed_file is not None:
+        return StageRecord(run.folder, stage, None, outputs, missing_or_changed(changed_file, run.folder))
+    requested = {"settings": settings, "files": _contents(inputs, run.folder)}
+    return StageRecord(run.folder, stage, Basis.of(requested, made_with(step)), outputs)
 
 
 def _settings_of_pictures(config: Config) -> dict[str, object]:
@@ -211,10 +233,15 @@ def _settings_of_pictures(config: Config) -> dict[str, object]:
     return settings
 
 
-def _contents(paths: Sequence[Path], data: Path) -> Mapping[str, str]:
+def _contents(names: Sequence[str], data: Path) -> Mapping[str, str]:
+    """Map each existing file of ``data`` to its SHA-256.
+
+    Args:
+        names: files of ``data``, and folders whose files are all listed.
+    """
     contents: dict[str, str] = {}
-    for path in paths:
-        for file in _files(path):
+    for name in names:
+        for file in _files(data / name):
             if file.exists():
                 contents[file.relative_to(data).as_posix()] = checksum(file)
     return contents

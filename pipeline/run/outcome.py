@@ -66,7 +66,7 @@ class Outcome:
         """Return a short name of a rendered episode's content: equal names mean equal bytes in a dataset."""
         row = self.row_of[episode_id]
         frames = self.frames[row.trajectory_id]
-        return digest(asdict(row), frames.made_by, frames.device, frames.replay_mode)[:16]
+        return digest(asdict(row), frames.fingerprint, frames.device, frames.replay_mode)[:16]
 
 
 def shuffled(episode_ids: Iterable[str]) -> list[str]:

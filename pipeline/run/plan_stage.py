@@ -8,7 +8,7 @@ from pipeline.identity import digest_library, made_with
 from pipeline.planning import plan
 from pipeline.record import Basis
 from pipeline.run import inputs
-from pipeline.run.finished import Memory
+from pipeline.run.finished import StageRecord
 from pipeline.run.layout import PLAN
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE
@@ -34,7 +34,7 @@ def make(config: Config) -> list[plan.Row]:
 
 def is_up_to_date(run: Run) -> bool:
     """Return whether the run has the plan that the stage would write: same settings, files, library and packages."""
-    return memory(run).holds()
+    return record(run).is_up_to_date()
 
 
 def upcoming(run: Run) -> Sequence[plan.Row]:
@@ -47,16 +47,16 @@ def upcoming(run: Run) -> Sequence[plan.Row]:
     """
     if is_up_to_date(run):
         return run.plan
-    records = [dataset.record_file for dataset in run.formats]
+    records = [dataset.record_file for dataset in run.datasets]
     written = (run.plan_file, run.trajectories.root / TABLE, run.frames.root / TABLE, *records)
     return make(run.config) if any(file.exists() for file in written) else []
 
 
-def memory(run: Run) -> Memory:
-    """Return the memory of the stage: settings, the user's files, library and packages that the plan depends on."""
+def record(run: Run) -> StageRecord:
+    """Return the record of the stage: settings, the user's files, library and packages that the plan depends on."""
     config = run.config
     settings = inputs.settings(config)
     sections = {name: settings[name] for name in ("demos", "plan", "replay")}
     requested = {"settings": sections, "files": inputs.listing(config)}
     basis = Basis.of(requested, {**made_with("physics"), "code": digest_library()[:16]})
-    return Memory(run.folder, "plan", basis, [PLAN])
+    return StageRecord(run.folder, "plan", basis, [PLAN])

@@ -92,11 +92,12 @@ class Progress:
         These are kept episodes, failures if ``export.failures`` requests them, and episodes with rejected frames, which
         would else be tried again. ``export.where`` selects among rendered episodes.
         """
-        failures = FAILURE_REASONS if self.export.failures else ()
         listed = []
         for row in self.rows:
             verdict = self.verdict(row)
-            if verdict.kept or verdict.reason in (self.rejected.get(row.episode_id), *failures):
+            has_rejected_frames = verdict.reason == self.rejected.get(row.episode_id)
+            is_requested_failure = self.export.failures and verdict.reason in FAILURE_REASONS
+            if verdict.kept or has_rejected_frames or is_requested_failure:
                 listed.append(row)
         return listed
 

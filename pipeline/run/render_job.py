@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline import gl
 from pipeline.axes import task_of
-from pipeline.compute.pool import LOST
+from pipeline.compute.pool import LOST, Job
 from pipeline.config import RenderConfig
 from pipeline.errors import PipelineError
 from pipeline.physics.quality import measure
@@ -22,7 +22,7 @@ from pipeline.types import Rendered, Trajectory
 
 
 @dataclass(frozen=True)
-class RenderJob:
+class RenderJob(Job[None]):
     """Streams of one trajectory to render into one file, as they are sent to a worker.
 
     Attributes:
@@ -61,12 +61,13 @@ class RenderJob:
             parts = [*parts, render(trajectory, task, missing, self.render_config, scene_of_process())]
         self._save(parts)
 
-    def frames_at_most(self) -> int:
+    def size(self) -> int:
+        """Return the largest possible number of frames."""
         return self.row.demo_steps * len(self.streams)
 
     def limit_s(self) -> float:
         """Return the time after which the job counts as hanging, in s: about twenty times the time without a GPU."""
-        return 1800.0 + 2.0 * self.frames_at_most()
+        return 1800.0 + 2.0 * self.size()
 
     def lost(self) -> None:
         """Store that no worker survived the streams, unless a worker stored them before it was lost.

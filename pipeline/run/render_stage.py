@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline import gl
-from pipeline.compute.pool import Expendable, Workers
+from pipeline.compute.pool import Workers, run_job
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row
@@ -119,9 +119,8 @@ def render_plan(
         # Jobs of many streams come first, so that none of them runs alone at the end. In jobs of few streams the scene
         # takes most of the time. They are ordered by task and demonstration, as a worker keeps shared parts of scenes.
         jobs.sort(key=lambda job: (-len(job.streams), job.row.suite, job.row.task, job.row.demo_id))
-        work = Expendable(RenderJob.__call__, RenderJob.limit_s, RenderJob.lost, RenderJob.frames_at_most)
         try:
-            workers(work, jobs, "render, frames")
+            workers(run_job, jobs, "render, frames")
         finally:
             scene_of_process().close()
 

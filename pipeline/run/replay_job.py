@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.axes import PhysicsPerturbation, from_json, of_layer, task_of
-from pipeline.compute.pool import LOST
+from pipeline.compute.pool import LOST, Job
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import RUN_AGAIN, PipelineError
 from pipeline.files import Edition, edition
@@ -23,7 +23,7 @@ from pipeline.types import Demo, Scene, Task, Trajectory, Verdict
 
 
 @dataclass(frozen=True)
-class ReplayJob:
+class ReplayJob(Job[Verdict]):
     """One trajectory's replay, as it is sent to a worker.
 
     Attributes:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.compute.pool import Expendable, Workers
+from pipeline.compute.pool import Workers, run_job
 from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row
@@ -71,7 +71,7 @@ class Replays:
         in_turn = sorted(map(row_of.__getitem__, missing), key=lambda row: row.demo_id)
         where = self.demos, self.replay_config, self.store.root
         jobs = [ReplayJob(row, twin_of[row.demo_id], *where) for row in in_turn]
-        self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
+        self.workers(run_job, jobs, "replay")
 
 
 def _reject_undone(files: Sequence[Path]) -> None:

@@ -101,27 +101,27 @@ class Run:
         return outcome.judge(self.plan, self.trajectories, self.frames, self.config)
 
     @property
-    def formats(self) -> list[AnyFormat]:
+    def datasets(self) -> list[AnyFormat]:
         """Datasets that the configuration requests."""
         return self.config.export.datasets(self.folder, self.config.render.content)
 
     def dataset(self, name: str) -> AnyFormat:
         """Return the dataset of a format that the configuration requests, such as ``rlds``."""
-        (dataset,) = (dataset for dataset in self.formats if dataset.name == name)
+        (dataset,) = (dataset for dataset in self.datasets if dataset.name == name)
         return dataset
 
     @property
-    def failure_formats(self) -> list[AnyFormat]:
+    def failure_datasets(self) -> list[AnyFormat]:
         """Datasets of failures that the configuration requests."""
         return self.config.export.failure_datasets(self.folder, self.config.render.content)
 
     @property
-    def recorded_formats(self) -> list[AnyFormat]:
+    def recorded_datasets(self) -> list[AnyFormat]:
         """Datasets that the configuration requests; datasets of failures only if they exist."""
-        recorded_failures = [dataset for dataset in self.failure_formats if dataset.record_file.exists()]
-        return [*self.formats, *recorded_failures]
+        recorded_failures = [dataset for dataset in self.failure_datasets if dataset.record_file.exists()]
+        return [*self.datasets, *recorded_failures]
 
-    def episodes(
+    def episode_loader(
         self,
         *,
         failures: bool = False,

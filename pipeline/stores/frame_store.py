@@ -33,13 +33,14 @@ class StoredFrames:
     """Record of one trajectory's stored frames, in all its files.
 
     Attributes:
-        made_by, device, replay_mode, actions_sha256: values of the table's columns.
+        fingerprint: value of the table's column ``made_by``.
+        device, replay_mode, actions_sha256: values of the table's columns.
         streams: ids of the rendered streams.
         rejected: id of each rejected stream to the reason.
         subtasks: subtasks of the trajectory; empty without rendered streams.
     """
 
-    made_by: str
+    fingerprint: str
     device: str
     replay_mode: str
     actions_sha256: str

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline import origins
 from pipeline.axes.language_lint import too_long
-from pipeline.compute.pool import LOST, Expendable, Workers
+from pipeline.compute.pool import LOST, Job, Workers, run_job
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.hdf5.layout import VALIDATION_FOLDER
@@ -75,9 +75,8 @@ def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayC
             jobs.append(_FileJob(root, task, replays, replay))
         except PipelineError as error:
             result.faults.append(str(error))
-    work = Expendable(_FileJob.__call__, _FileJob.limit_s, _FileJob.lost)
     first_with: dict[str, DemoEntry] = {}
-    for entries, of_file in run(work, jobs, "files"):
+    for entries, of_file in run(run_job, jobs, "files"):
         result.demonstrations += len(entries)
         result.replayed += of_file.replayed
         result.faults += of_file.faults
@@ -119,7 +118,7 @@ _Result = tuple[Sequence[DemoEntry], CheckedDemos]
 
 
 @dataclass(frozen=True)
-class _FileJob:
+class _FileJob(Job[_Result]):
     root: Path
     task: Task
     replays: int

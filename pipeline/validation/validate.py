@@ -90,11 +90,11 @@ def validate(run: Run, workers: Workers) -> dict[str, Any]:
     total.note("stores", _unlike_stores(run), len(rows))
     with scratch(run.path(WORK) / "validate") as cache:
         try:
-            job = EpisodesJob(run, run.formats, cache, frozenset(choose_rerendered(rows)))
+            job = EpisodesJob(run, run.datasets, cache, frozenset(choose_rerendered(rows)))
             total.add(_check_datasets(job, kept, workers))
             failed = _failed_rows(run)
             if failed:
-                job = EpisodesJob(run, run.failure_formats, cache, frozenset([*failed][:1]), of_failures=True)
+                job = EpisodesJob(run, run.failure_datasets, cache, frozenset([*failed][:1]), of_failures=True)
                 total.add(_check_datasets(job, failed, workers), within=f"{FAILURES}/")
         finally:
             scene_of_process().close()
@@ -109,7 +109,7 @@ def _failed_rows(run: Run) -> dict[str, ManifestRow]:
     failures = set(run.outcome.failures) if run.config.export.failures else set()
     if not failures:
         return {}
-    places = registry.places(run.failure_formats)
+    places = registry.places(run.failure_datasets)
     failed: dict[str, ManifestRow] = {}
     for row in run.manifest:
         episode_id = row["episode_id"]
@@ -305,7 +305,7 @@ class EpisodesJob:
             rewrites[row["episode_id"]] = list_episode_rewrites(
                 language, row["suite"], row["task"], row["perturbations"]
             )
-        load = self.run.episodes(failures=self.of_failures, rewrites=rewrites)
+        load = self.run.episode_loader(failures=self.of_failures, rewrites=rewrites)
         for row in rows:
             self._check(row, load, results)
         return results

@@ -40,7 +40,7 @@ def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
     if run.path(DATASETS).exists():
         with suppress(PipelineError):  # Reading the tables reports the fault.
             records = read_json(run.path(DATASETS))
-    for dataset in (*run.formats, *_failure_formats(run, records)):
+    for dataset in (*run.datasets, *_failure_datasets(run, records)):
         name = dataset.folder.relative_to(run.folder).as_posix()
         results[name] = _verify_dataset(dataset, records.get(_record_of(dataset, run)), workers)
     results["tables"] = _result(_unreadable(read) for read in _readers(run))
@@ -64,14 +64,14 @@ def _record_of(dataset: AnyFormat, run: Run) -> str:
     return dataset.record_file.relative_to(run.folder).as_posix()
 
 
-def _failure_formats(run: Run, records: Collection[str]) -> list[AnyFormat]:
+def _failure_datasets(run: Run, records: Collection[str]) -> list[AnyFormat]:
     """List the datasets of failures that were written, or of which something is left. A run without failures has none.
 
     Args:
         records: paths of the records that the exports listed.
     """
     written = []
-    for dataset in run.failure_formats:
+    for dataset in run.failure_datasets:
         if dataset.folder.exists() or dataset.record_file.exists() or _record_of(dataset, run) in records:
             written.append(dataset)
     return written

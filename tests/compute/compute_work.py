@@ -1,11 +1,13 @@
-"""Functions for workers, in a module that imports quickly."""
+"""Functions and jobs for workers, in a module that imports quickly."""
 
 import os
 import resource
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline import gl
+from pipeline.compute.pool import Job
 from pipeline.errors import PipelineError
 
 BLOCK_BYTES = 3 * 256 * 256
@@ -36,12 +38,43 @@ def die(_: int) -> int:
     os._exit(1)
 
 
-def die_or_hang(number: int) -> int:
-    if number == 2:
-        die(number)
-    if number == 3:
-        time.sleep(1000)
-    return number
+@dataclass(frozen=True)
+class SquareJob(Job[int]):
+    """Job that squares its number, which is also its size."""
+
+    number: int
+
+    def __call__(self) -> int:
+        return square(self.number)
+
+    def limit_s(self) -> float:
+        return 1.0
+
+    def lost(self) -> int:
+        return square(self.number)
+
+    def size(self) -> int:
+        return self.number
+
+
+@dataclass(frozen=True)
+class DieOrHangJob(Job[int]):
+    """Job that ends its worker for number 2, and hangs for number 3."""
+
+    number: int
+
+    def __call__(self) -> int:
+        if self.number == 2:
+            die(self.number)
+        if self.number == 3:
+            time.sleep(1000)
+        return self.number
+
+    def limit_s(self) -> float:
+        return 2.0 if self.number == 3 else 300.0
+
+    def lost(self) -> int:
+        return -self.number
 
 
 def mark(file: Path) -> None:

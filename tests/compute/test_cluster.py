@@ -22,7 +22,7 @@ from pipeline import gl
 from pipeline.axes import Axes
 from pipeline.compute import cluster as cluster_module
 from pipeline.compute.cluster import Workplace, setup
-from pipeline.compute.pool import runner
+from pipeline.compute.pool import run_job, runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
@@ -184,7 +184,7 @@ def test_a_worker_with_another_device_is_rejected(cluster: Start, tmp_path: Path
         runner(ComputeConfig(cluster=address), tmp_path / "data") as work,
         pytest.raises(PipelineError, match="this worker renders with") as caught,
     ):
-        work(RenderJob.__call__, [job], "render")
+        work(run_job, [job], "render")
     assert device in str(caught.value)
     assert not (tmp_path / "frames").exists()
 

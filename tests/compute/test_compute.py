@@ -13,12 +13,23 @@ from pathlib import Path
 
 import psutil
 import pytest
-from compute_work import BLOCK_BYTES, die, die_or_hang, gpu, mark, pages_asked_for, process, reject_two, square
+from compute_work import (
+    BLOCK_BYTES,
+    DieOrHangJob,
+    SquareJob,
+    die,
+    gpu,
+    mark,
+    pages_asked_for,
+    process,
+    reject_two,
+    square,
+)
 from conftest import REPOSITORY
 from distributed import LocalCluster, Nanny
 
 from pipeline import gl
-from pipeline.compute.pool import TRIES, Expendable, loop, runner
+from pipeline.compute.pool import TRIES, loop, run_job, runner
 from pipeline.compute.progress import progress_of
 from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
@@ -69,8 +80,8 @@ def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(
 
 def test_progress_is_counted_in_what_items_hold(capsys: pytest.CaptureFixture[str]) -> None:
     """Else a bar of few large items stands still, and the time that is left is wrong."""
-    work = Expendable(square, limit_s=lambda _: 1.0, lost=square, size=lambda number: number)
-    assert loop(work, [1, 9, 10], "squares, sides") == [1, 81, 100]
+    jobs = [SquareJob(1), SquareJob(9), SquareJob(10)]
+    assert loop(run_job, jobs, "squares, sides") == [1, 81, 100]
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(",")[1].split(": ")[1] for line in lines] == ["10/20", "20/20"]
 
@@ -87,11 +98,9 @@ def test_a_log_says_how_far_long_work_is(
 
 @pytest.mark.slow
 def test_work_that_ends_its_workers_is_given_up_or_ends_the_run_with_words(tmp_path: Path) -> None:
-    expendable = Expendable(
-        die_or_hang, limit_s=lambda number: 2.0 if number == 3 else 300.0, lost=lambda number: -number
-    )
+    jobs = [DieOrHangJob(number) for number in (1, 2, 3, 4, 5)]
     with runner(ComputeConfig(cluster="local", workers=2), tmp_path) as run:
-        assert run(expendable, [1, 2, 3, 4, 5], "some deaths") == [1, -2, -3, 4, 5]
+        assert run(run_job, jobs, "some deaths") == [1, -2, -3, 4, 5]
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
             run(die, [1], "deaths")
         assert run(square, [3], "squares") == [9], "a new worker has come"

@@ -252,7 +252,7 @@ def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     tasks = tuple(select(CHOSEN.model_copy(update={"episodes": 2})))
     replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
     job = EvaluationJob(replayed, tasks, "")
-    assert job.episodes() == 2
+    assert job.size() == 2
     assert job.limit_s() > 3600
     assert job.lost() == dict.fromkeys(tasks, "worker_lost")
     episode, versions = replayed.episode(tasks[0]), replayed.versions(tasks[0])

@@ -210,7 +210,7 @@ def test_a_run_of_small_frames_with_a_further_view(short_demos: Path, tmp_path: 
 def frames_of(folder: Path, config: dict[str, object]) -> dict[str, dict[str, list[Jpeg]]]:
     """Return the stored frames of every kept episode by view."""
     opened = Run(Config.model_validate({**config, "folder": folder / "data"}))
-    load, stored = opened.episodes(), {}
+    load, stored = opened.episode_loader(), {}
     for episode_id in opened.outcome.kept:
         stored[episode_id] = {view: list(files) for view, files in load(episode_id).frames.items()}
     return stored

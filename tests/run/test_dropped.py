@@ -125,7 +125,7 @@ def test_frames_of_another_quality_count_whatever_the_table_lists(change: str, t
     assert (measured.streams, measured.share, measured.asks) == (left, 1.0, True)
     run.frames.keep([])
     assert run.frames.rows_of_all_settings() == {}
-    assert run.frames.untouched()
+    assert run.frames.changed_file() is None
 
 
 def test_datasets_count_as_finished_work_after_their_frames_were_deleted(clone: Path) -> None:

@@ -13,11 +13,11 @@ from pipeline.config import Config, load
 from pipeline.formats.rlds import Rlds
 from pipeline.run import dataset_basis, export
 from pipeline.run.dataset_files import is_unchanged
-from pipeline.run.finished import Memory, previews_memory, report_memory, summary_memory, validate_memory
+from pipeline.run.finished import StageRecord, previews_record, report_record, summary_record, validate_record
 from pipeline.run.run import Run
 from pipeline.stores.store import TABLE
 
-REMEMBERED: tuple[Callable[[Run], Memory], ...] = (validate_memory, summary_memory, report_memory, previews_memory)
+RECORDS: tuple[Callable[[Run], StageRecord], ...] = (validate_record, summary_record, report_record, previews_record)
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def config(clone: Path) -> Config:
 
 def hold(config: Config) -> list[bool]:
     """Whether ``validate``, ``summary`` and ``report`` would do nothing, and ``summary`` would leave the previews."""
-    return [of(Run(config)).holds() for of in REMEMBERED]
+    return [of(Run(config)).is_up_to_date() for of in RECORDS]
 
 
 def largest(folder: Path) -> Path:
@@ -81,14 +81,15 @@ def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[boo
 
 
 def test_previews_are_rendered_again_for_other_views(tmp_path: Path) -> None:
-    previews_memory(run_in(tmp_path)).keep()
-    assert previews_memory(run_in(tmp_path)).holds()
-    assert previews_memory(run_in(tmp_path, render={"size_px": 128})).holds(), "previews have a size of their own"
+    previews_record(run_in(tmp_path)).write()
+    assert previews_record(run_in(tmp_path)).is_up_to_date()
+    smaller = run_in(tmp_path, render={"size_px": 128})
+    assert previews_record(smaller).is_up_to_date(), "previews have a size of their own"
     further = run_in(tmp_path, render={"views": ["frontview"]})
-    assert not previews_memory(further).holds()
-    previews_memory(further).keep()
-    assert previews_memory(further).holds()
-    assert not previews_memory(run_in(tmp_path, render={"views": ["birdview"]})).holds()
+    assert not previews_record(further).is_up_to_date()
+    previews_record(further).write()
+    assert previews_record(further).is_up_to_date()
+    assert not previews_record(run_in(tmp_path, render={"views": ["birdview"]})).is_up_to_date()
 
 
 @pytest.mark.parametrize(
@@ -105,18 +106,18 @@ def test_a_lost_file_is_named(config: Config, name: str, stage: str) -> None:
     lost = config.run_folder / name
     if lost.is_dir():
         lost = max(lost.rglob("*.*"), key=lambda file: (file.is_file() and file.name != TABLE, file.stat().st_size))
-    assert stages.why_not(stage, Run(config)) is None
+    assert stages.reason_to_run(stage, Run(config)) is None
     lost.unlink()
     reason = f"{lost.relative_to(config.run_folder).as_posix()} is missing"
-    assert stages.why_not(stage, Run(config)) == reason
+    assert stages.reason_to_run(stage, Run(config)) == reason
     if name != "datasets.json":
-        assert validate_memory(Run(config)).why_not() == reason
+        assert validate_record(Run(config)).reason_to_run() == reason
 
 
 def test_what_found_something_off_is_not_remembered(config: Config) -> None:
     rot(largest(config.run_folder / "rlds"))
     (config.run_folder / "validation.json").unlink()
-    assert not validate_memory(Run(config)).holds(), "so everything is read again, also what looks unchanged"
+    assert not validate_record(Run(config)).is_up_to_date(), "so everything is read again, also what looks unchanged"
 
 
 def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Config) -> None:

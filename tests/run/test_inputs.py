@@ -10,7 +10,7 @@ from conftest import STOVE, link_testset, run_in
 
 from pipeline.run import inputs
 from pipeline.run.run import Run
-from pipeline.stages import STAGES, make_plan, perform, why_not
+from pipeline.stages import STAGES, make_plan, perform, reason_to_run
 
 
 def test_a_file_is_known_by_its_content_and_a_large_one_by_its_time(tmp_path: Path) -> None:
@@ -44,6 +44,6 @@ def test_a_file_that_changes_while_the_plan_is_made_leads_to_another_plan(
     with monkeypatch.context() as patch:
         patch.setitem(STAGES, "plan", replace(STAGES["plan"], work=plan_and_edit))
         perform("plan", Run(config))
-    assert why_not("plan", Run(config)) is not None
+    assert reason_to_run("plan", Run(config)) is not None
     perform("plan", Run(config))
-    assert why_not("plan", Run(config)) is None
+    assert reason_to_run("plan", Run(config)) is None

@@ -103,7 +103,7 @@ def test_only_what_the_export_names_counts_as_chosen(run: Outcome) -> None:
     assert {row["axis"] for row in table(run, Where(axis=("robot",))) if row["chosen"]} == {"robot"}
 
 
-@pytest.mark.parametrize("change", [{"device": "another"}, {"made_by": "another"}, {"replay_mode": "tracked"}])
+@pytest.mark.parametrize("change", [{"device": "another"}, {"fingerprint": "another"}, {"replay_mode": "tracked"}])
 def test_other_frames_are_another_content(run: Outcome, change: dict[str, str]) -> None:
     """By which a dataset is made again."""
     noise = run.rows[1]

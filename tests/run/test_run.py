@@ -333,7 +333,7 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(
     before = contents(clone / "data" / "tiny")
     first = dvc(clone, "repro")
     assert first.returncode == 0, first.stdout + first.stderr
-    assert first.stdout.count("up to date") == len([one for one in stages.STAGES.values() if one.outputs or one.memory])
+    assert first.stdout.count("up to date") == len([one for one in stages.STAGES.values() if one.outputs or one.record])
     assert contents(clone / "data" / "tiny") == before, "what the command `run` made is up to date for DVC too"
     assert stages_to_run(clone) == {"inputs"}
     again = dvc(clone, "repro")

@@ -67,7 +67,7 @@ def test_two_runs_that_start_at_the_same_time_make_their_own_datasets(short_demo
     before = contents(place / "data" / "first")
     again = run_pipeline(place, "run", str(elsewhere / "first.yaml"))
     assert again.returncode == 0, again.stdout + again.stderr
-    assert again.stdout.count("up to date") == len([one for one in stages.STAGES.values() if one.outputs or one.memory])
+    assert again.stdout.count("up to date") == len([one for one in stages.STAGES.values() if one.outputs or one.record])
     after = contents(place / "data" / "first")
     assert {name for name in before | after if before.get(name) != after.get(name)} <= {"inputs.json", "settings.json"}
 

@@ -37,7 +37,7 @@ def given_up(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
 
     tests/compute/test_compute.py tests workers that die.
     """
-    return [fn.lost(item) for item in items]
+    return [item.lost() for item in items]
 
 
 def nothing_to_do(fn: Any, items: Sequence[Any], description: str) -> list[Any]:

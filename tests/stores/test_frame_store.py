@@ -116,7 +116,7 @@ def test_finished_work_is_generated_again_only_where_that_was_allowed(
         again = FrameStore(tmp_path / "frames", config.render)
         again.keep(render_into(tmp_path / "frames", rows, config, replayed, loop))
         assert not outdated(rows, stored, again, gl.choose().device), "a remake is asked for once"
-        assert again.settings_by_fingerprint().keys() == {again.made_by}
+        assert again.settings_by_fingerprint().keys() == {again.fingerprint}
 
 
 def test_what_the_user_changed_is_made_without_a_question(
