@@ -1,6 +1,7 @@
 """Reading of a run's manifest with pandas: python examples/read_manifest.py data/starter
 
-The manifest has a row for every planned episode, kept or dropped. ``episode_id`` joins it with both datasets.
+The manifest has a row for every planned episode, kept or dropped. ``episode_id`` joins it with both datasets. The run
+must have perturbed episodes, and datasets of RLDS and LeRobot.
 ``schemas/manifest.json`` describes each column.
 """
 

@@ -23,6 +23,7 @@ SURROUNDINGS = {
     errno.ENOENT: ("the file is missing", f"run `{MAKE_AGAIN}`, which performs all stages in order"),
     errno.ENOTDIR: ("a file is in the place of a folder", f"move it to another place, and {GO_ON}"),
     errno.EEXIST: ("an existing file is in the place of a folder", f"move it to another place, and {GO_ON}"),
+    errno.ENAMETOOLONG: ("the name is too long for the file system", "choose a shorter name"),
     errno.EISDIR: ("a folder is in the place of a file", f"move it to another place, and {GO_ON}"),
     errno.ELOOP: ("symbolic links form a cycle", f"correct the links, and {GO_ON}"),
     errno.EMFILE: ("too many files are open", f"raise the limit (`ulimit -n 4096`), and {GO_ON}"),
@@ -34,6 +35,9 @@ SURROUNDINGS = {
     errno.EIO: ("the disk has an error", "run `python -m pipeline dataset check CONFIG`, which lists damaged files"),
 }
 """Error number of the system to its description and remedy. All other errors are bugs and keep their traceback."""
+
+STORAGE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG})
+"""Error numbers of ``SURROUNDINGS`` that a network never causes."""
 
 
 class Terminated(KeyboardInterrupt):

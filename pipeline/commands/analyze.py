@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from pipeline.commands.base import (
+    FILE_TO_WRITE,
     PATH,
     Command,
     LazyGroup,
@@ -145,7 +146,7 @@ def gap(results: Path) -> None:
 
 
 @click.command(cls=Command, epilog=example("analyze construct --out tasks.json --size 1000"))
-@click.option("--out", metavar="FILE", type=PATH, required=True, help="File of the list of tasks to write.")
+@click.option("--out", metavar="FILE", type=FILE_TO_WRITE, required=True, help="File of the list of tasks to write.")
 @click.option(
     "--size", metavar="N", type=click.IntRange(min=1), help="Number of tasks of the benchmark (default: 10,000)."
 )
@@ -186,7 +187,9 @@ def construct(out: Path, size: int | None, results: tuple[Path, ...], trained_on
 
 @click.command(cls=Command, epilog=example("analyze grade results/act results/pi05 --out graded.json"))
 @click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=PATH, help="Results of one model each.")
-@click.option("--out", metavar="FILE", type=PATH, required=True, help="File of the list of graded tasks to write.")
+@click.option(
+    "--out", metavar="FILE", type=FILE_TO_WRITE, required=True, help="File of the list of graded tasks to write."
+)
 def grade(folders: tuple[Path, ...], out: Path) -> None:
     """Grade the difficulty of tasks, 1 to 5, by the number of models that solve each task.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import select
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
@@ -18,6 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args,
 import click
 from click.shell_completion import CompletionItem
 
+from pipeline.errors import PipelineError
+from pipeline.exit_status import GO_ON
+
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
@@ -26,17 +30,41 @@ if TYPE_CHECKING:
 
 
 class Command(click.Command):
-    """Command whose function returns an exit status, or `None` for 0."""
+    """Command whose function returns an exit status, or `None` for 0.
+
+    Raises:
+        PipelineError: when the reader of the output ends before the command, as its work is then unfinished.
+    """
+
+    only_lists = False
+    """True if the command only prints a list, of which a reader such as `head` may have enough."""
 
     def invoke(self, context: click.Context) -> int:
         try:
             status = super().invoke(context)
             sys.stdout.flush()  # While a closed pipe can still be handled, unlike when Python ends.
-        except BrokenPipeError:
-            # The reader of the output, such as `head`, has ended. Python must not write to it when it ends.
+        except BrokenPipeError as error:
+            if not _has_lost_its_reader(sys.stdout.fileno()):
+                raise
+            # Python must not write to the pipe when it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
+            if self.only_lists:
+                return 0
+            raise PipelineError("the command stopped, as nothing reads its output any more", remedy=GO_ON) from error
         return int(status or 0)
+
+
+class ListCommand(Command):
+    """Command that only prints a list."""
+
+    only_lists = True
+
+
+def _has_lost_its_reader(descriptor: int) -> bool:
+    """Return whether ``descriptor`` is a pipe or a socket whose other end is closed."""
+    poll = select.poll()
+    poll.register(descriptor, 0)
+    return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
 
 
 class Listed(NamedTuple):
@@ -146,6 +174,18 @@ def example(*commands: str) -> str:
 
 
 PATH = click.Path(path_type=Path)
+
+
+class _FileToWrite(click.Path):
+    """Path of a file to write, which may not exist yet. A path that ends with a slash names a folder."""
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
+        if str(value).endswith(os.sep):
+            self.fail(f"{value!r} names a folder; add the name of the file to write", parameter, context)
+        return super().convert(value, parameter, context)
+
+
+FILE_TO_WRITE = _FileToWrite(path_type=Path)
 
 result_paths_argument = click.argument(
     "results",

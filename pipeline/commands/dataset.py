@@ -9,7 +9,17 @@ from typing import Any
 
 import click
 
-from pipeline.commands.base import PATH, Command, LazyGroup, Listed, OneOf, config_argument, example, open_run
+from pipeline.commands.base import (
+    FILE_TO_WRITE,
+    PATH,
+    Command,
+    LazyGroup,
+    Listed,
+    OneOf,
+    config_argument,
+    example,
+    open_run,
+)
 from pipeline.errors import PipelineError
 
 dataset = LazyGroup(
@@ -116,7 +126,9 @@ def audit(dataset: Path, manifest: Path | None) -> int:
     default="agentview",
     help="View that the picture should show (default: agentview).",
 )
-@click.option("--sheet", metavar="FILE", type=PATH, help="PNG file to write: picture, frame and their difference.")
+@click.option(
+    "--sheet", metavar="FILE", type=FILE_TO_WRITE, help="PNG file to write: picture, frame and their difference."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the report as one line of JSON.")
 def compare_frame(picture: Path, task: str, init_state: int, view: str, sheet: Path | None, as_json: bool) -> int:
     """Compare the first observation of your own evaluation with the frame of the datasets.

@@ -6,7 +6,16 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.base import PATH, Command, OneOf, config_argument, example, load_config
+from pipeline.commands.base import (
+    FILE_TO_WRITE,
+    PATH,
+    Command,
+    ListCommand,
+    OneOf,
+    config_argument,
+    example,
+    load_config,
+)
 
 EVERY = "all"
 """Argument in place of an axis, for one picture of each axis."""
@@ -27,10 +36,10 @@ def doctor(config: Path) -> int:
     from pipeline.run.run import Run
     from pipeline.validation import doctor
 
-    return int(bool(doctor.run(Run(load_config(config)))))
+    return int(bool(doctor.run(Run(load_config(config)), config_file=config)))
 
 
-@click.command(cls=Command, epilog=example("axes"))
+@click.command(cls=ListCommand, epilog=example("axes"))
 def axes() -> None:
     """List the axes of perturbation, with their components, regenerated parts of an episode and changed views."""
     from rich.console import Console
@@ -51,7 +60,7 @@ def axes() -> None:
     print("Pictures of an axis: see `python -m pipeline preview --help`.")
 
 
-@click.command(cls=Command, epilog=example("tasks 'libero_goal/*'"))
+@click.command(cls=ListCommand, epilog=example("tasks 'libero_goal/*'"))
 @click.argument(
     "patterns", metavar="[PATTERN]...", nargs=-1, help="Patterns as in demos.tasks, such as 'libero_goal/*'."
 )
@@ -108,7 +117,11 @@ def _axes() -> Iterable[str]:
     help="Configuration whose seed, ranges and demonstrations are used (default: the starter set and default ranges).",
 )
 @click.option(
-    "--out", metavar="FILE", type=PATH, default=Path("sheet.png"), help="Picture to write (default: sheet.png)."
+    "--out",
+    metavar="FILE",
+    type=FILE_TO_WRITE,
+    default=Path("sheet.png"),
+    help="Picture to write (default: sheet.png).",
 )
 def preview(task: str, axis: str, config: Path | None, out: Path) -> None:
     """Render perturbations of a task into one picture.
@@ -170,7 +183,9 @@ def sources(config: Path) -> None:
     ),
 )
 @click.argument("bddl_file", metavar="BDDL_FILE", type=PATH, help="File of the task, <suite>/<task>.bddl.")
-@click.option("--out", metavar="FILE", type=PATH, required=True, help="Bank to extend or create, such as bank.yaml.")
+@click.option(
+    "--out", metavar="FILE", type=FILE_TO_WRITE, required=True, help="Bank to extend or create, such as bank.yaml."
+)
 @click.option(
     "--per-class",
     metavar="N",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.base import Command, NamesOption, OneOf, config_argument, example, open_run
+from pipeline.commands.base import Command, ListCommand, NamesOption, OneOf, config_argument, example, open_run
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def results(run: Run) -> dict[str, Path]:
     }
 
 
-@click.command(cls=Command, epilog=example("status configs/starter.yaml"))
+@click.command(cls=ListCommand, epilog=example("status configs/starter.yaml"))
 @config_argument
 def status(config: Path) -> None:
     """Show the wanted and kept episodes of a run, the stages that would run and the reasons, disk and time.
@@ -68,7 +68,7 @@ def status(config: Path) -> None:
 
     from pipeline.status import describe
 
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False)
     for part in describe(open_run(config)):
         console.print(part)
 
@@ -113,8 +113,17 @@ def clean(config: Path, only: tuple[str, ...], yes: bool) -> None:
     if not yes:
         if not sys.stdin.isatty():
             raise PipelineError("nothing was deleted, because there is no terminal to ask in", remedy="add --yes")
-        if input("Delete these files? [y/N] ").strip().lower() not in ("y", "yes"):
+        if not _confirmed("Delete these files? [y/N] "):
             print("nothing was deleted")
             return
     cleaning.delete(run, list(size_of_part))
     print("deleted")
+
+
+def _confirmed(question: str) -> bool:
+    """Ask at the terminal. The end of the input (Ctrl-D) is a no."""
+    try:
+        return input(question).strip().lower() in ("y", "yes")
+    except EOFError:
+        print()
+        return False

@@ -4,12 +4,13 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-import httpx
 from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.hf_api import RepoSibling
 
 from pipeline.errors import PipelineError
+from pipeline.exit_status import STORAGE_ERRORS
 from pipeline.files import checksum
+from pipeline.hub import TRANSFER_ERRORS
 from pipeline.libero.hdf5 import SUFFIX
 from pipeline.libero.tasks import tasks
 
@@ -63,7 +64,9 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
             # The files are public, so a mirror need not see the user's token.
             token=False,
         )
-    except (OSError, httpx.HTTPError) as error:  # the second since huggingface-hub 1
+    except TRANSFER_ERRORS as error:
+        if isinstance(error, OSError) and error.errno in STORAGE_ERRORS:
+            raise
         raise PipelineError(
             f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
         ) from error

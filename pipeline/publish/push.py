@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, errors, get_token
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 from huggingface_hub.hf_api import RepoFile
 
@@ -25,6 +25,7 @@ from pipeline.files import checksum, read_json
 from pipeline.formats.base import Format
 from pipeline.generated import read_record, unchanged
 from pipeline.grouping import grouped
+from pipeline.hub import TRANSFER_ERRORS
 from pipeline.publish.card import CHECKSUMS, REPOSITORY
 from pipeline.publish.repository import (
     UPLOAD,
@@ -41,9 +42,6 @@ from pipeline.run.dataset_files import OFT_STATISTICS
 from pipeline.run.inputs import published_settings
 from pipeline.run.layout import CARD, FINETUNE
 from pipeline.run.run import Run
-
-UPLOAD_ERRORS = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
-"""Errors of an upload. Only huggingface-hub before version 1 has a ``XetError``; only later versions use httpx."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def compare(upload: Upload, repository: str, *, private: bool = False, replace: 
     try:
         name = _full_name(api, repository)
         there = read(api, name)
-    except UPLOAD_ERRORS as error:
+    except TRANSFER_ERRORS as error:
         return f"the content of {repository} and its deleted files are unknown: {' '.join(str(error).split())}"
     if there is None:
         return f"{name} does not exist or is hidden from your token: it would be created"
@@ -217,7 +215,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, replace: boo
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
             api.create_tag(repository, tag=upload.tag, revision=commit.oid, repo_type="dataset")
-    except UPLOAD_ERRORS as error:
+    except TRANSFER_ERRORS as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url
 

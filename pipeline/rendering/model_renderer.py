@@ -80,7 +80,7 @@ class ModelRenderer(ABC):
     def start_frame(self, data: mujoco.MjData, camera: str) -> Callable[[], Frame]:
         """Start to render a frame, and return a function that waits for the frame and returns it.
 
-        The state may change meanwhile. By default, the frame is rendered at once.
+        The state may change meanwhile. The default renders the frame at once.
         """
         frame = self.frame(data, camera)
         return lambda: frame

@@ -93,6 +93,11 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     for file in file_of.values():
         _reject_other_demonstrations(file)
         outputs.reject_other_file(file)
+    if not remake_allowed():
+        # The same check of kept rows comes after hours of replays.
+        candidates = grouped((f"{row.suite}/{row.task}", row) for row in rows if row.role == "perturbed")
+        for task, file in file_of.items():
+            _reject_loss(file, candidates.get(str(task), []))
     store = TrajectoryStore(out / ".replays")
     require_remake_permission(store.outdated({row.trajectory_id for row in rows}), store.root)
     faults: dict[str, str] = {}

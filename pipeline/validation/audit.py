@@ -162,16 +162,37 @@ def _visible_files(folder: Path, name: str) -> list[Path]:
 
 
 def _rlds(folder: Path) -> Iterator[StoredEpisode]:
-    features = info_of(folder).features
+    info = info_of(folder)
+    count = 0
     for shard in sorted(folder.glob("*.tfrecord*")):
         for number, record in enumerate(records(shard)):
-            step = columns(record, features)
+            count += 1
+            step = columns(record, info.features)
             stored = {name.removeprefix(METADATA): value for name, value in step.items() if name.startswith(METADATA)}
-            text = {name: stored[name][0].decode() for name in ("episode_id", *LABELS) if name in stored}
-            episode_id = text.pop("episode_id", "") or f"{shard.name}:{number}"
+            text = {}
+            for name in (EPISODE_ID, *LABELS):
+                # Sets of other origin may store numbers under these names.
+                if name in stored and isinstance(stored[name][0], bytes):
+                    text[name] = stored[name][0].decode()
+            episode_id = text.pop(EPISODE_ID, "") or f"{shard.name}:{number}"
             texts = dict.fromkeys(step["language_instruction"].tolist())
             instructions = tuple(text.decode() for text in texts if text)
             yield StoredEpisode(episode_id, instructions, stored.get("image_extrinsics"), **text)
+    _require_whole(folder, count, sum(split.num_examples for split in info.splits.values()))
+
+
+def _require_whole(folder: Path, count: int, stated: int) -> None:
+    """Reject a dataset of which files are missing or only links, or that has no episode.
+
+    Args:
+        count: number of episodes that were read.
+        stated: number of episodes by the dataset's own description.
+
+    Raises:
+        ValueError: naming the folder and both numbers.
+    """
+    if not count or count != stated:
+        raise ValueError(f"{folder} has {count} episodes, and its description states {stated}")
 
 
 def _lerobot(folder: Path) -> Iterator[StoredEpisode]:
@@ -198,6 +219,8 @@ def _lerobot(folder: Path) -> Iterator[StoredEpisode]:
             None if matrix is None else np.reshape(matrix, SCHEMA.extrinsics.shape),
             **{name: row.get(name) for name in LABELS},
         )
+    stated = json.loads((folder / "meta" / "info.json").read_text())["total_episodes"]
+    _require_whole(folder, len(episodes), stated)
 
 
 def _ids(folder: Path) -> dict[int, str]:

@@ -3,6 +3,7 @@
 import base64
 import ctypes.util
 import hashlib
+import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,10 +30,10 @@ from pipeline.errors import PipelineError
 from pipeline.formats.registry import FORMATS
 from pipeline.identity import DISTRIBUTION, describe_outdated
 from pipeline.libero.demonstrations import HDF5Source
-from pipeline.libero.tasks import select_tasks
+from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.origins import REINSTALL
 from pipeline.run import dropped, machine, plan_stage
-from pipeline.run.claim import find_missing_parent
+from pipeline.run.claim import find_missing_parent, open_run, reject_unmarked
 from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import join_kinds, outdated
 from pipeline.run.run import Run
@@ -85,10 +86,11 @@ def check(run: Run, need_gb: float) -> list[Diagnosis]:
     ]
 
 
-def run(run: Run, *, tried: bool = False) -> list[str]:
+def run(run: Run, *, config_file: Path | None = None, tried: bool = False) -> list[str]:
     """Print the results of ``check`` and of a trial for a configuration.
 
     Args:
+        config_file: file of the configuration if it has not claimed the run's folder yet. The folder is then checked.
         tried: True if the trial has run before on this machine, which has not changed since.
 
     Returns:
@@ -98,6 +100,8 @@ def run(run: Run, *, tried: bool = False) -> list[str]:
     # of the others.
     left_mb = (max(0.0, mb - size_mb(run.path(folder))) for folder, mb in needed_mb(run.config).items())
     findings = check(run, max(sum(left_mb), RUN_MB) / 1e3)
+    if config_file is not None:
+        findings.append(_folder(config_file, run.folder))
     if not _list_failed(findings):
         findings += _tried(run, tried)
     console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -279,11 +283,14 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     without = [name for name, count in counts.items() if not count]
     if without:
         none = f"{len(without)} of {len(counts)} tasks have no demonstration under {root}, such as {without[0]}"
-        remedy = (
-            f"download LIBERO's with `python -m pipeline demos fetch {root} SUITE`, or generate some of its tasks with "
-            f"`python -m pipeline demos expand {root} --per-task 50 --tasks {without[0]}`; or set demos.root and "
-            "demos.tasks to your folder and its tasks"
-        )
+        remedy = "set demos.root and demos.tasks to your folder and its tasks"
+        of_libero = [name for name in without if name.split("/")[0] in SUITES]
+        if of_libero:
+            folder, task = shlex.quote(str(root)), shlex.quote(of_libero[0])
+            remedy = (
+                f"download LIBERO's with `python -m pipeline demos fetch {folder} SUITE`, or generate some of its "
+                f"tasks with `python -m pipeline demos expand {folder} --per-task 50 --tasks {task}`; or {remedy}"
+            )
         return Diagnosis("demos", "fail", none, remedy)
     detail = f"{sum(counts.values())} demonstrations of {len(counts)} tasks under {root}"
     few = [name for name, count in counts.items() if count < (demos.per_task or 1)]
@@ -324,6 +331,16 @@ def _download(name: str, file: Path, can_fetch: bool, tool: str, otherwise: Stat
 
 def _has_pip() -> bool:
     return shutil.which(downloads.pip()[0]) is not None
+
+
+def _folder(config_file: Path, folder: Path) -> Diagnosis:
+    """Check that a run of the configuration may use its folder."""
+    try:
+        open_run(config_file)
+        reject_unmarked(folder)
+    except PipelineError as error:
+        return Diagnosis("folder", "fail", f"{error.where}: {error.what}", error.remedy or "")
+    return Diagnosis("folder", "ok", f"{folder} is of this configuration, or new")
 
 
 def _disk(run: Run, need_gb: float) -> Diagnosis:

@@ -1,5 +1,6 @@
 """What a user types: every command explains itself at once, and those around a run do what they say."""
 
+import io
 import json
 import os
 import re
@@ -192,6 +193,46 @@ def test_a_reader_that_has_enough_is_no_error(pattern: str, reader: str, lines: 
     assert (done.stdout.count("\n"), done.stderr) == (lines, "")
 
 
+UNFINISHED = """
+import sys
+import click
+from pipeline.commands.base import Command
+from pipeline.exit_status import exit_status
+
+@click.command(cls=Command)
+def work():
+    for number in range(100_000):
+        print(number)
+
+sys.exit(exit_status(lambda: work.main([], standalone_mode=False)))
+"""
+
+
+def test_a_command_whose_output_nobody_reads_any_more_has_not_finished() -> None:
+    """Unlike a list: a run whose log writer dies must not end like a finished one."""
+    piped = f"{sys.executable} -c '{UNFINISHED}' | head -n 1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(
+        ["bash", "-c", piped], cwd=REPOSITORY, env=IN_SCRIPTS, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (1, "0\n")
+    assert done.stderr.startswith("error: the command stopped, as nothing reads its output any more\n")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["preview", "libero_goal/turn_on_the_stove", "camera", "--out", "pictures/"],
+        ["analyze", "construct", "--out", "lists/"],
+    ],
+)
+def test_a_file_to_write_does_not_have_the_name_of_a_folder(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pipeline", *words])
+    assert main() == 2
+    assert f"'{words[-1]}' names a folder; add the name of the file to write" in capsys.readouterr().err
+
+
 @pytest.fixture
 def clone(finished: Path, tmp_path: Path) -> Path:
     """A copy of the finished run that may change."""
@@ -280,6 +321,34 @@ def test_status_says_what_is_kept_and_what_would_run(
     counted = {cells[1].strip(): cells[2].strip() for line in told.splitlines() if len(cells := line.split("│")) > 2}
     assert "clean" not in counted
     assert counted["camera"] == "3"
+
+
+class EndedTerminal(io.StringIO):
+    """A terminal at which the user presses Ctrl-D."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_end_of_the_input_is_a_no(
+    clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", EndedTerminal())
+    monkeypatch.setattr(sys, "argv", ["pipeline", "clean", "configs/tiny.yaml"])
+    with chdir(clone):
+        assert main() == 0
+    assert capsys.readouterr().out.endswith("nothing was deleted\n")
+    assert (clone / "data" / "tiny" / "manifest.parquet").exists()
+
+
+def test_doctor_finds_that_the_folder_is_of_another_configuration(
+    clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(clone / "configs" / "tiny.yaml", clone / "configs" / "mine.yaml")
+    monkeypatch.setattr(sys, "argv", ["pipeline", "doctor", "configs/mine.yaml"])
+    with chdir(clone):
+        assert main() == 1
+    assert re.search(r"^fail +folder ", capsys.readouterr().err, re.MULTILINE)
 
 
 def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:

@@ -1,9 +1,10 @@
 """Downloads are whole or named, resume where they stopped, and stay inside their folder."""
 
+import errno
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from conftest import served
 
 from pipeline.errors import PipelineError
+from pipeline.libero import fetch as fetching
 from pipeline.libero.fetch import REPOSITORY, REVISION, fetch
 from pipeline.libero.tasks import tasks
 
@@ -218,6 +220,25 @@ def test_an_unreachable_hub_names_the_starter_set(tmp_path: Path, folder_in_use:
     with pytest.raises(PipelineError, match="starter set") as caught:
         fetch(tmp_path, ["libero_goal"], "http://127.0.0.1:9")
     assert REPOSITORY in str(caught.value)
+
+
+def test_errors_of_the_transfer_and_of_the_disk_have_their_own_remedies(
+    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """hf_xet raises a ``RuntimeError``. A full disk is no fault of the network."""
+
+    def fail(error: Exception) -> Callable[..., str]:
+        def download(*arguments: object, **options: object) -> str:
+            raise error
+
+        return download
+
+    monkeypatch.setattr(fetching, "snapshot_download", fail(RuntimeError("CAS service error")))
+    with pytest.raises(PipelineError, match=r"stopped \(CAS service error\)\n  try: check the network"):
+        fetch(tmp_path / "demos", ["libero_goal"], hub.endpoint)
+    monkeypatch.setattr(fetching, "snapshot_download", fail(OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(OSError, match="No space left"):
+        fetch(tmp_path / "demos", ["libero_goal"], hub.endpoint)
 
 
 def test_an_unknown_suite_is_rejected_before_any_request(hub: Hub, tmp_path: Path) -> None:

@@ -173,7 +173,7 @@ def write_instructions(texts: Sequence[str], folder: Path) -> None:
     """Write what an audit reads of a LeRobot dataset that has one episode for each instruction, and no labels."""
     meta = folder / "meta" / "episodes" / "chunk-000"
     meta.mkdir(parents=True)
-    (folder / "meta" / "info.json").write_text("{}")
+    (folder / "meta" / "info.json").write_text(json.dumps({"total_episodes": len(texts)}))
     rows = [{"episode_index": index, "tasks": [text]} for index, text in enumerate(texts)]
     pq.write_table(pa.Table.from_pylist(rows), meta / "file-000.parquet")
 
@@ -336,6 +336,27 @@ def test_code_that_a_dataset_names_is_not_run(
             audit(tmp_path / "set", test)
         assert not (tmp_path / "ran").exists()
         assert str(tmp_path) in sys.path
+
+
+@pytest.mark.parametrize(
+    ("name", "lost", "read", "stated"),
+    [
+        ("rlds", "**/*.tfrecord-00001-of-00002", 3, 6),
+        ("rlds", "**/*.tfrecord-*", 0, 6),
+        ("lerobot", "**/meta/episodes/**/*.parquet", 0, 6),
+    ],
+)
+def test_a_dataset_without_all_of_its_files_is_rejected(
+    datasets: Path, test: TestSet, tmp_path: Path, name: str, lost: str, read: int, stated: int
+) -> None:
+    """As after a partial download: what is left must not pass for the whole."""
+    copy = shutil.copytree(datasets / name, tmp_path / name)
+    files = list(copy.glob(lost))
+    assert files
+    for file in files:
+        file.unlink()
+    with pytest.raises(PipelineError, match=f"has {read} episodes, and its description states {stated}"):
+        audit(copy, test)
 
 
 def test_a_folder_without_a_dataset_is_rejected(tmp_path: Path, test: TestSet) -> None:
