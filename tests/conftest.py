@@ -69,7 +69,18 @@ SHORT = {STOVE: 12, BOWL: 11, MILK: 18}
 """Number of last actions that are kept; the goal is reached within them."""
 
 
-SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage", "expanded", "at_resets", "everything"}
+SLOW_FIXTURES = {
+    "whole",
+    "environment",
+    "plate_environment",
+    "crowded",
+    "stage",
+    "expanded",
+    "at_resets",
+    "everything",
+    "golden",
+    "installed",
+}
 """Fixtures that mark a test as slow, also if it uses them through another fixture: see ``-m "not slow"``."""
 
 

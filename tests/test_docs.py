@@ -9,6 +9,8 @@ import pytest
 from command_words import parse
 from conftest import REPOSITORY
 
+from pipeline.config import load
+
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("benchmarks/*.md")])
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
@@ -60,3 +62,13 @@ def test_the_command_line_takes_the_commands_of_the_pages(monkeypatch: pytest.Mo
     assert len(given) >= 15
     for _, arguments in given:
         parse(arguments)
+
+
+def test_the_numbers_of_episodes_in_the_readme_are_those_of_the_configurations() -> None:
+    rows = re.findall(r"^\| `(\w+\.yaml)` \| ([\d,]+) \|", (REPOSITORY / "README.md").read_text(), re.MULTILINE)
+    stated = {name: int(number.replace(",", "")) for name, number in rows}
+    planned = {name: sum(load(REPOSITORY / "configs" / name).plan.episodes.values()) for name in stated}
+    assert stated == planned
+    assert len(stated) == 7
+        *stated
+    }

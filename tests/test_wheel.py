@@ -53,7 +53,6 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site-packages"
 
 
-@pytest.mark.slow
 def test_an_installed_library_reads_its_own_files(installed: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", READ],

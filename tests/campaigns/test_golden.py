@@ -17,7 +17,6 @@ def golden() -> Golden:
     return Golden(recorded()["cases"])
 
 
-@pytest.mark.slow
 def test_physics(golden: Golden) -> None:
     assert golden.physics() == recorded()["physics"][str(identity.RECIPES["physics"])], REMEDY
 
