@@ -70,5 +70,3 @@ def test_the_numbers_of_episodes_in_the_readme_are_those_of_the_configurations()
     planned = {name: sum(load(REPOSITORY / "configs" / name).plan.episodes.values()) for name in stated}
     assert stated == planned
     assert len(stated) == 7
-        *stated
-    }
