@@ -37,7 +37,7 @@ SURROUNDINGS = {
 """Error number of the system to its description and remedy. All other errors are bugs and keep their traceback."""
 
 STORAGE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG})
-"""Error numbers of ``SURROUNDINGS`` that a network never causes."""
+"""Error numbers of ``SURROUNDINGS`` that a folder for downloads may cause."""
 
 
 class Terminated(KeyboardInterrupt):

@@ -52,7 +52,7 @@ results_argument = click.argument("results", metavar="DIR", type=PATH, help="Fol
 @click.option(
     "--out",
     metavar="FILE",
-    type=PATH,
+    type=FILE_TO_WRITE,
     default=Path("report.html"),
     help="Page to write, with a JSON file next to it (default: report.html).",
 )

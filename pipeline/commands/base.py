@@ -33,7 +33,7 @@ class Command(click.Command):
     """Command whose function returns an exit status, or `None` for 0.
 
     Raises:
-        PipelineError: when the reader of the output ends before the command, as its work is then unfinished.
+        PipelineError: when the reader of the output ends while the command works, as its work is then unfinished.
     """
 
     only_lists = False
@@ -42,15 +42,17 @@ class Command(click.Command):
     def invoke(self, context: click.Context) -> int:
         try:
             status = super().invoke(context)
-            sys.stdout.flush()  # While a closed pipe can still be handled, unlike when Python ends.
         except BrokenPipeError as error:
-            if not _has_lost_its_reader(sys.stdout.fileno()):
-                raise
-            # Python must not write to the pipe when it ends.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if not _has_lost_its_reader(sys.stdout.fileno()):  # Click would end without a message.
+                raise PipelineError("the connection to another process broke", remedy=GO_ON) from error
+            _discard_output()
             if self.only_lists:
                 return 0
             raise PipelineError("the command stopped, as nothing reads its output any more", remedy=GO_ON) from error
+        try:
+            sys.stdout.flush()  # While a closed pipe can still be handled, unlike when Python ends.
+        except BrokenPipeError:  # The work is finished.
+            _discard_output()
         return int(status or 0)
 
 
@@ -58,6 +60,11 @@ class ListCommand(Command):
     """Command that only prints a list."""
 
     only_lists = True
+
+
+def _discard_output() -> None:
+    """Send the rest of the output nowhere: Python writes it when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _has_lost_its_reader(descriptor: int) -> bool:

@@ -49,7 +49,7 @@ top = LazyGroup(
         },
         "Before a run": {
             "demos": Listed("demos", "Fetch, expand or check demonstrations."),
-            "doctor": Listed("prepare", "Check versions, OpenGL, disk, memory and demonstrations for a run."),
+            "doctor": Listed("prepare", "Check versions, OpenGL, folder, disk, memory and demonstrations for a run."),
             "preview": Listed("prepare", "Render perturbations of a task into one picture."),
             "axes": Listed("prepare", "List the axes of perturbation and their components."),
             "tasks": Listed("prepare", "List the tasks and their instructions."),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.base import PATH, Command, example, result_paths_argument
+from pipeline.commands.base import FILE_TO_WRITE, PATH, Command, example, result_paths_argument
 
 
 @click.command(
@@ -21,7 +21,7 @@ from pipeline.commands.base import PATH, Command, example, result_paths_argument
     "--out",
     metavar="FILE",
     required=True,
-    type=PATH,
+    type=FILE_TO_WRITE,
     help="New configuration; its name, without .yaml, becomes the name of the run.",
 )
 @click.option(

@@ -27,7 +27,7 @@ DEFAULTS = {"name": "preview", "plan": {"episodes": {}}}
 @click.command(cls=Command, epilog=example("doctor configs/starter.yaml"))
 @config_argument
 def doctor(config: Path) -> int:
-    """Check versions, OpenGL, disk, memory and demonstrations for a run.
+    """Check versions, OpenGL, folder, disk, memory and demonstrations for a run.
 
     Each check prints a line that begins with ok, warn or fail, and a remedy below it. No file of the run is
     written. If the plan is outdated, a new one is sampled, which may download textures or objects. The exit status is 1

@@ -115,6 +115,18 @@ def open_run(file: Path) -> Run:
     return Run(config)
 
 
+def reject_unusable_folder(file: Path) -> None:
+    """Reject a configuration whose folder ``claim_folder`` would not claim; nothing is written.
+
+    Raises:
+        PipelineError: as ``claim_folder``.
+    """
+    config = load(file)
+    _reject_other_owner(config, file)
+    if config.run_folder.exists():
+        _reject_links(config.run_folder)
+
+
 def reject_unmarked(folder: Path) -> None:
     """Reject a folder with files that no configuration has claimed, as the files do not belong to a run.
 

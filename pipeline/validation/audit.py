@@ -186,12 +186,12 @@ def _require_whole(folder: Path, count: int, stated: int) -> None:
 
     Args:
         count: number of episodes that were read.
-        stated: number of episodes by the dataset's own description.
+        stated: number of episodes by the dataset's own description; 0 if it states none.
 
     Raises:
         ValueError: naming the folder and both numbers.
     """
-    if not count or count != stated:
+    if not count or (stated and count != stated):
         raise ValueError(f"{folder} has {count} episodes, and its description states {stated}")
 
 
@@ -219,7 +219,7 @@ def _lerobot(folder: Path) -> Iterator[StoredEpisode]:
             None if matrix is None else np.reshape(matrix, SCHEMA.extrinsics.shape),
             **{name: row.get(name) for name in LABELS},
         )
-    stated = json.loads((folder / "meta" / "info.json").read_text())["total_episodes"]
+    stated = json.loads((folder / "meta" / "info.json").read_text()).get("total_episodes", 0)
     _require_whole(folder, len(episodes), stated)
 
 

@@ -33,7 +33,7 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.origins import REINSTALL
 from pipeline.run import dropped, machine, plan_stage
-from pipeline.run.claim import find_missing_parent, open_run, reject_unmarked
+from pipeline.run.claim import find_missing_parent, reject_unusable_folder
 from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import join_kinds, outdated
 from pipeline.run.run import Run
@@ -336,8 +336,7 @@ def _has_pip() -> bool:
 def _folder(config_file: Path, folder: Path) -> Diagnosis:
     """Check that a run of the configuration may use its folder."""
     try:
-        open_run(config_file)
-        reject_unmarked(folder)
+        reject_unusable_folder(config_file)
     except PipelineError as error:
         return Diagnosis("folder", "fail", f"{error.where}: {error.what}", error.remedy or "")
     return Diagnosis("folder", "ok", f"{folder} is of this configuration, or new")

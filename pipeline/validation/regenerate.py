@@ -16,7 +16,7 @@ from pipeline import gl
 from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import remove
 from pipeline.formats.base import ManifestRow
 from pipeline.formats.episodes import EpisodeFacts, Episodes
 from pipeline.formats.rlds import Rlds, RldsConfig
@@ -61,8 +61,12 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     if out.exists() and any(out.iterdir()):
         raise PipelineError("the folder is not empty", where=out, remedy="name a new folder with --out")
     device = gl.choose().device
-    with replaced(out) as temporary:  # A stopped call leaves nothing, so that it can be repeated.
-        rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), temporary, root)
+    try:
+        rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), out, root)
+    except BaseException:
+        for entry in out.glob("*"):  # A stopped call leaves nothing, so that it can be repeated.
+            remove(entry)
+        raise
     dataset = next(manifest_file.parent.glob(f"rlds/*/*/{row['rlds_shard']}"), None)
     stored = None if dataset is None else _record(dataset, row["rlds_index"])
     differs = _differences(stored[1], rebuilt[1]) if stored and rebuilt else {}

@@ -223,6 +223,8 @@ def test_a_command_whose_output_nobody_reads_any_more_has_not_finished() -> None
     [
         ["preview", "libero_goal/turn_on_the_stove", "camera", "--out", "pictures/"],
         ["analyze", "construct", "--out", "lists/"],
+        ["analyze", "report", "results", "--out", "report.html/"],
+        ["focus", "results", "--from", "configs/small.yaml", "--out", "configs/x.yaml/"],
     ],
 )
 def test_a_file_to_write_does_not_have_the_name_of_a_folder(
