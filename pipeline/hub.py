@@ -14,5 +14,5 @@ TRANSFER_ERRORS = (
 """Errors of a download or an upload.
 
 Only huggingface-hub before version 1 has a ``XetError``; only later versions use httpx. The package hf_xet, which
-transfers the content of files, raises a ``RuntimeError``.
+transfers the content of files, may raise a ``RuntimeError``.
 """

@@ -64,8 +64,9 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     try:
         rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), out, root)
     except BaseException:
-        for entry in out.glob("*"):  # A stopped call leaves nothing, so that it can be repeated.
-            remove(entry)
+        # A stopped call leaves none of its files, so that it can be repeated.
+        for name in (PLAN, TRAJECTORIES, FRAMES, Rlds.name, f"{Rlds.name}.json"):
+            remove(out / name)
         raise
     dataset = next(manifest_file.parent.glob(f"rlds/*/*/{row['rlds_shard']}"), None)
     stored = None if dataset is None else _record(dataset, row["rlds_index"])
