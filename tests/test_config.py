@@ -286,6 +286,7 @@ def test_no_run_is_stored_where_all_runs_store(name: str, tmp_path: Path, monkey
         load(file)
 
 
+@pytest.mark.slow
 def test_missing_and_broken_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(REPOSITORY)
     with pytest.raises(PipelineError, match=r"no\.yaml: there is no such configuration"):

@@ -15,6 +15,7 @@ from pipeline.jit import DISPATCHERS
 from pipeline.validation.loops import compile_all
 
 
+@pytest.mark.slow
 def test_every_loop_is_compiled_once_and_for_all() -> None:
     for module in pkgutil.walk_packages(pipeline.__path__, "pipeline."):
         apart = module.name.endswith(".lerobot_eval")  # which needs lerobot 0.6

@@ -31,6 +31,7 @@ def run_with_other_code(*command: object, **environment: str) -> subprocess.Comp
     return subprocess.run(words, env=everything, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_imports_change_no_environment_variable_and_work_in_any_order() -> None:
     script = """
 import os
@@ -52,6 +53,7 @@ print(len([name for name in sys.modules if name.startswith("pipeline.")]))
     assert int(done.stdout) > 180
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "program",
     [
@@ -99,6 +101,7 @@ def test_every_program_of_this_project_starts_itself_with_the_variables() -> Non
     assert unprepared == WITHOUT_COMPUTATION
 
 
+@pytest.mark.slow
 def test_no_file_is_stored_or_identified_with_other_machine_code() -> None:
     script = """
 from pathlib import Path
@@ -122,6 +125,7 @@ for use in (lambda: TrajectoryStore(Path("none")), lambda: made_with("physics"))
     assert (done.stdout.strip(), done.stderr) == (FIXED, "")
 
 
+@pytest.mark.slow
 def test_no_demonstration_is_replayed_with_other_machine_code() -> None:
     script = """
 from pipeline.config import ReplayConfig
@@ -136,6 +140,7 @@ replay(environment_of(task), StarterSource().demonstration(task), "clean", Repla
     assert "NumPy computes with Sandybridge" in done.stderr
 
 
+@pytest.mark.slow
 def test_tests_and_documentation_have_the_variables() -> None:
     assert tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest_env"] == MACHINE_CODE_VARIABLES
     text = (REPOSITORY / "docs" / "cost.md").read_text()

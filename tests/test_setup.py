@@ -97,6 +97,7 @@ def tree(tmp_path: Path) -> Tree:
     return Tree(tmp_path)
 
 
+@pytest.mark.slow
 def test_installs_once_and_again_when_the_lock_changes(tree: Tree) -> None:
     done = tree.setup()
     assert done.returncode == 0, done.stderr
@@ -157,6 +158,7 @@ def test_an_environment_of_the_user_is_moved_aside(tree: Tree) -> None:
     assert [*tree.root.glob(".venv.*")] == [aside]
 
 
+@pytest.mark.slow
 def test_a_tool_that_stops_is_named_with_what_to_try(tree: Tree) -> None:
     assert tree.setup().returncode == 0
     (tree.root / ".venv" / "bin" / "uv").write_text("#!/bin/bash\necho no host >&2; exit 1\n")
@@ -189,6 +191,7 @@ def test_without_root_it_names_what_is_missing_and_stops(tree: Tree) -> None:
     assert not (tree.root / ".venv").exists()
 
 
+@pytest.mark.slow
 def test_with_root_it_installs_what_is_missing(tree: Tree) -> None:
     tree.libraries(*LIBRARIES[:-1])
     tree.stub("id", "echo 0")
@@ -212,6 +215,7 @@ def test_checks_style_types_and_behaviour(tree: Tree, verb: str, selection: str)
     assert {one, other} == {"mypy", f"pytest -n 2 --dist loadfile --no-loadscope-reorder {selection}".rstrip()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failing", ["ruff", "mypy", "pytest"])
 def test_each_check_can_fail_the_verb(tree: Tree, failing: str) -> None:
     assert tree.setup().returncode == 0
@@ -219,6 +223,7 @@ def test_each_check_can_fail_the_verb(tree: Tree, failing: str) -> None:
     assert tree.setup("quick").returncode == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pythons", "taken"),
     [

@@ -170,6 +170,7 @@ def test_held_out_goals_are_tested_from_liberos_states(shipped: Experiment) -> N
     assert experiment.evaluation.episodes(experiment.tasks) == len(tested) + len(instructed)
 
 
+@pytest.mark.slow
 def test_held_out_perturbations_share_nothing_with_the_episodes_of_any_arm(shipped: Experiment) -> None:
     """Textures and objects are compared by their names; a light must differ from every planned one in its numbers."""
     experiment = read(EFFECT / "further" / "axes.yaml")
@@ -278,6 +279,7 @@ def test_without_embeddings_nothing_begins(tmp_path: Path, shipped: Experiment) 
         sentences.write(["dance"], tmp_path / "bin" / "python", tmp_path / "sentences.npz")
 
 
+@pytest.mark.slow
 def test_a_task_without_embeddings_is_rejected_before_any_work(tmp_path: Path) -> None:
     run = yaml.safe_load((EFFECT / "data.yaml").read_text())
     run["demos"]["tasks"][0] = "libero_goal/put_the_bowl_on_the_stove"
@@ -315,6 +317,7 @@ def test_each_demonstration_gives_an_arm_one_episode(arm: str, shipped: Experime
     assert {name: by_axis[name] for name in planned} == planned
 
 
+@pytest.mark.slow
 def test_further_episodes_join_those_of_an_arm(tmp_path: Path, shipped: Experiment) -> None:
     """Tasks get episodes by their weights; the arm's own episodes stay."""
     experiment = with_further(tmp_path, {"seed": 1, "episodes": {"camera": 8, "noise": 16}})

@@ -153,6 +153,7 @@ def test_half_of_the_perturbations_have_their_own_colours_and_show_every_kind_of
         assert shown >= {"normal", "height", "gloss", "reflection", "occlusion", "flat"}
 
 
+@pytest.mark.slow
 def test_what_is_in_its_own_colours_is_the_image_as_it_is() -> None:
     """A normal map in MuJoCo's texture, next to the same image that OpenCV makes as large."""
     model = mujoco.MjModel.from_xml_string(

@@ -210,6 +210,7 @@ def test_only_tasks_of_tested_suites_get_a_second_change(test_set: TestSet) -> N
         assert p.nearest(test_set, OF_LIBERO_90) == (np.inf, 0)
 
 
+@pytest.mark.slow
 def test_a_task_of_libero_90_in_a_tested_scene_keeps_its_clearance(test_set: TestSet) -> None:
     """Scenes are compared by the text of LIBERO's files: four sections that have no goal and no instruction."""
 

@@ -111,6 +111,7 @@ def hands_m(trajectory: Trajectory, steps: range) -> Floats:
     return np.array(positions)
 
 
+@pytest.mark.slow
 def test_recorded_actions_that_a_push_does_not_stop_are_dropped(tmp_path: Path) -> None:
     """They reach the goal and show nothing of how to work against it."""
     demos = DemosConfig(tasks=(f"{BOWL.suite}/{BOWL.name}",))

@@ -249,6 +249,7 @@ def test_other_axes_perturb_the_task_in_its_scene() -> None:
         assert row.reset_seed == goal.reset_seed
 
 
+@pytest.mark.slow
 def test_a_rewrite_that_means_two_things_of_the_scene_is_left_out() -> None:
     """A can is soup or tomato sauce where both stand."""
     left_out = 0
@@ -260,6 +261,7 @@ def test_a_rewrite_that_means_two_things_of_the_scene_is_left_out() -> None:
     assert left_out > 0
 
 
+@pytest.mark.slow
 def test_every_rewrite_joined_with_the_axis_goal_names_its_things() -> None:
     """A description such as this one holds in the task's own scene, which has no milk."""
     riddle, test = "find the only thing here that you would pour into a glass and drink", benchmark.load()

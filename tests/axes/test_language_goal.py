@@ -173,6 +173,7 @@ def test_no_other_task_of_a_scene_is_taken_for_a_rewrite() -> None:
     assert accepted == []
 
 
+@pytest.mark.slow
 def test_rewrites_of_another_task_of_the_scene_are_rejected_where_things_have_their_names() -> None:
     """The shipped rewrites that call things by their names, as rewrites of the scene's other tasks."""
     groups = {task: group for group in by_scene().values() for task in group}

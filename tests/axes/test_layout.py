@@ -75,6 +75,7 @@ def test_equal_perturbations_give_equal_scenes(
     assert again.resolved == changed.resolved
 
 
+@pytest.mark.slow
 def test_the_level_is_the_number_of_objects() -> None:
     for level in (1, 2, 3, 4, 5):
         perturbations = [LayoutAxis(levels=(level,)).sample(seeding.rng(level, key), PLATE, 0) for key in range(20)]

@@ -192,6 +192,7 @@ def naive_glass(frame: Frame, effect: Glass, offsets: NDArray[np.int8]) -> Frame
     return to_frame(gaussian(out / 255, effect.sigma_px, channel_axis=-1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", AXIS.glass, ids=repr)
 def test_glass_equals_naive_loop(effect: Glass) -> None:
     frame = make_frame(40, 56)
@@ -262,6 +263,7 @@ def test_training_grid_is_off_the_test_grid(component: str) -> None:
         assert not {effect.max_scale for effect in AXIS.zoom} & tested_scales
 
 
+@pytest.mark.slow
 def test_held_out_strengths_are_the_even_severities() -> None:
     for component, tested in TEST_GRID.items():
         held_out = [effect.model_dump() for effect in getattr(NoiseAxis.held_out(), component)]
@@ -388,6 +390,7 @@ def test_equal_keys_sample_equal_perturbations_and_json_reads_back(seed: int) ->
     assert NoisePerturbation.model_validate_json(sampled.model_dump_json()) == sampled
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10_000),

@@ -179,6 +179,7 @@ def pulled_away(libero: Environment, posture_rad: Floats) -> tuple[Floats, Float
     return reached, before, libero.state
 
 
+@pytest.mark.slow
 def test_a_controllers_posture_pulls_the_arm_as_in_the_benchmark() -> None:
     """The benchmark's robot tasks change the posture of LIBERO's reset, and put an initial state in after it."""
     libero = Environment(PLATE)

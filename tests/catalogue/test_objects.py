@@ -472,6 +472,7 @@ def test_what_is_wrong_with_a_user_s_folder_is_named(
         assert list(folder.glob("own/*")) == []
 
 
+@pytest.mark.slow
 def test_a_configuration_can_name_a_folder(folder: Path, tmp_path: Path) -> None:
     write_house(tmp_path / "mine" / "toy_house", scale=0.01)
     sources = ["libero", {"folder": str(tmp_path / "mine"), "licence": "CC0-1.0", "author": "Jane Doe"}]

@@ -146,6 +146,7 @@ def test_a_checkpoint_whose_weights_lerobot_did_not_load_is_rejected(
         Checkpoint(folder)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_names_code_of_other_packages_is_rejected_before_it_runs(tmp_path: Path) -> None:
     """lerobot imports and calls what a checkpoint names, its own functions that run a file too."""
     folder, ran, code = checkpoints.save(tmp_path, 0.25), tmp_path / "ran", tmp_path / "code.py"

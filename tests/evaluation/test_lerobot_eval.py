@@ -87,6 +87,7 @@ def test_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
     ours.close()
 
 
+@pytest.mark.slow
 def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 2)
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoints.save(tmp_path / "act", 0.0)), label="act")
@@ -125,6 +126,7 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
         env.close()
 
 
+@pytest.mark.slow
 def test_options_that_change_the_policy_are_part_of_its_identity(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,6 +158,7 @@ def test_options_that_change_the_policy_are_part_of_its_identity(
         with_options.check(listed)
 
 
+@pytest.mark.slow
 def test_limits_of_openvla_and_lerobot_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(STEP_LIMITS, "libero_spatial", 1)
     monkeypatch.setattr(environment, "LEROBOT_SPATIAL", 2)

@@ -7,6 +7,7 @@ from functools import cache
 
 import mujoco
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.evaluation import libero_plus
@@ -79,6 +80,7 @@ def benchmark_camera(test: TestTask) -> Pose:
     return pos, quat
 
 
+@pytest.mark.slow
 def test_every_camera_is_the_benchmarks() -> None:
     tests = [test for test in load().by_name.values() if test.axis == "camera"]
     assert len(tests) == 1599

@@ -128,6 +128,7 @@ def test_statistics_are_in_metres_over_all_pixels(dataset: LeRobot) -> None:
             assert np.ravel(stated[column][name])[0] == pytest.approx(figure, rel=1e-9), name
 
 
+@pytest.mark.slow
 def test_the_bytes_are_the_same_each_time(dataset: LeRobot, tmp_path: Path) -> None:
     assert files(write(tmp_path).root) == files(dataset.root)
 

@@ -97,6 +97,7 @@ print(sorted({"torch", "tensorflow", "lerobot"} & sys.modules.keys()))
 """
 
 
+@pytest.mark.slow
 def test_rlds_is_made_and_checked_and_lerobot_written_without_torch(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_TORCH, str(tmp_path)],

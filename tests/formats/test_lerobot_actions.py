@@ -14,6 +14,7 @@ from pipeline.formats.lerobot import LeRobot, LeRobotConfig
 from pipeline.run.export import export
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("choice", "trained", "other"),
     [

@@ -75,6 +75,7 @@ def of_first(dataset: LeRobot | LeRobotV21) -> list[Fault]:
     return list(CHECKS["statistics"].find(Case({}, source, replay_of(source), [copy], None)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", WITH_IMAGES)
 def test_ids_and_numbers_of_steps_and_statistics_are_read(version: str, tmp_path: Path) -> None:
     dataset = WITH_IMAGES[version](tmp_path)

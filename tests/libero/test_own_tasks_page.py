@@ -41,6 +41,7 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
     return load(CONFIG)
 
 
+@pytest.mark.slow
 def test_the_files_of_the_page_are_valid(config: Config) -> None:
     (task,) = select_tasks(config.demos.tasks)
     assert str(task) == "table/lay_the_bowl_on_the_plate"

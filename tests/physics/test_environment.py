@@ -32,6 +32,7 @@ control_env()
 """
 
 
+@pytest.mark.slow
 def test_another_user_may_own_the_log_of_robosuite() -> None:
     done = subprocess.run([sys.executable, "-c", ANOTHERS_LOG], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -182,6 +182,7 @@ def test_what_misses_once_settled_is_tracked_along_its_unsettled_replay(tmp_path
     assert TrajectoryStore(tmp_path).load(twin.trajectory_id).mode == "tracked"
 
 
+@pytest.mark.slow
 def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> None:
     environment = Environment(STOVE)
     np.random.seed(5)

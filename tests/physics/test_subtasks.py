@@ -269,6 +269,7 @@ def test_a_bowl_among_bowls_has_its_place_at_the_start() -> None:
         ]
 
 
+@pytest.mark.slow
 def test_a_stack_in_the_hand_is_moved_and_placed() -> None:
     task = find_task("libero_90", "LIVING_ROOM_SCENE4_stack_the_right_bowl_on_the_left_bowl_and_place_them_in_the_tray")
     environment = Environment(task)

@@ -68,6 +68,7 @@ def of_the_task() -> list[benchmark.TestTask]:
     return [one for one in benchmark.load(FOLDER).on_axis("pose") if (one.suite, one.base) == (MILK.suite, MILK.name)]
 
 
+@pytest.mark.slow
 def test_no_object_stands_where_a_test_has_it(tmp_path: Path) -> None:
     source = write_expanded(tmp_path)
     entries = source.index([MILK]).entries

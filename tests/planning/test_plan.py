@@ -142,6 +142,7 @@ def test_a_replay_setting_is_part_of_the_identity() -> None:
     assert not kept & {row.episode_id for row in plan.make(entries(), config(), REPLAY, NO_TESTS)}
 
 
+@pytest.mark.slow
 @given(st.lists(st.booleans(), min_size=12, max_size=12))
 def test_replacements_until_full_or_exhausted(succeeds: list[bool]) -> None:
     rows = plan.make(entries(), config(), REPLAY, NO_TESTS)
@@ -216,6 +217,7 @@ def test_an_exhausted_axis_is_said_and_planned_as_far_as_it_goes() -> None:
     assert plan.shortage(plan.make(entries(), config(), REPLAY, NO_TESTS), config()) == {}
 
 
+@pytest.mark.slow
 def test_a_demonstration_without_further_perturbations_leaves_the_places_to_the_others() -> None:
     """The last perturbations are found by chance: of 60, one demonstration finds more of them than another."""
     few = BackgroundAxis(components=("surface",), sources=("libero",))

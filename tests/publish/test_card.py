@@ -199,6 +199,7 @@ NAMES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", NAMES)
 def test_columns_in_addition_to_the_frames_are_described_where_they_are_there(data: Path, kind: str) -> None:
     plain = written(data, kind)

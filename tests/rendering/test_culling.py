@@ -34,6 +34,7 @@ def scene(shadows: bool) -> str:
     </mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shadows", [False, True], ids=["lights", "shadows"])
 def test_the_same_pixels_with_fewer_geoms(shadows: bool) -> None:
     rng = seeding.rng("test_culling", "eyes")

@@ -88,6 +88,7 @@ def pair(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
         yield made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [False, True], ids=["lights", "shadows"], indirect=True)
 def test_the_same_pixels_whatever_moves(pair: Pair) -> None:
     rng, data = seeding.rng("test_layers", "moves"), pair.opened.data
@@ -142,6 +143,7 @@ def test_geoms_that_stand_still_are_rendered_once(pair: Pair) -> None:
     assert sum(pair.rendered) < 20 * BODIES
 
 
+@pytest.mark.slow
 def test_what_trembles_is_left_out_of_the_layer(pair: Pair) -> None:
     for step in range(90):
         pair.opened.data.mocap_pos[:3, 2] += 1e-5 * (step % 5 == 0)

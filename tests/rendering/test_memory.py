@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import arenas
+import pytest
 
 from pipeline.compute.workers import VARIABLES
 
@@ -24,6 +25,7 @@ print(own_mb() - before_mb - model.nbuffer / 2**20)
 """
 
 
+@pytest.mark.slow
 def test_a_worker_returns_the_memory_that_compiling_a_scene_needs(tmp_path: Path) -> None:
     """The model has 230 MB. MuJoCo keeps the files that it has read, 177 MB. glibc's default kept 117 MB more."""
     scene = tmp_path / "scene.xml"

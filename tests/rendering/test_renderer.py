@@ -117,6 +117,7 @@ def painted(shape: str, image: Path) -> str:
     </mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_scene_after_one_that_failed_half_way_is_shown_as_it_is(tmp_path: Path) -> None:
     image, broken = tmp_path / "image.png", tmp_path / "broken.png"
     cv2.imwrite(str(image), np.arange(192, dtype=np.uint8).reshape(8, 8, 3))
@@ -164,6 +165,7 @@ opened.renderer(scene).frame("agentview")
 '''
 
 
+@pytest.mark.slow
 def test_a_process_that_leaves_its_scene_open_ends_without_a_word() -> None:
     done = subprocess.run([sys.executable, "-c", LEFT_OPEN], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")

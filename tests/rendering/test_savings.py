@@ -42,6 +42,7 @@ def renderer_in_use() -> type:
         return type(renderer.model_renderer)
 
 
+@pytest.mark.slow
 def test_on_a_tested_device_savings_are_used_without_a_word(caplog: pytest.LogCaptureFixture) -> None:
     assert gl.choose().device.startswith(savings.DEVICE)
     assert renderer_in_use() is SoftwareRenderer
@@ -61,6 +62,7 @@ def test_another_version_or_device_renders_plainly_and_says_so(
     assert other in record.getMessage()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sharing", "kind"), [(1, InFlightRenderer), (2, InFlightRenderer), (3, LayeredRenderer)])
 def test_a_gpu_renders_layers_if_enough_processes_share_it(
     sharing: int, kind: type, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -71,6 +73,7 @@ def test_a_gpu_renders_layers_if_enough_processes_share_it(
     assert caplog.records == []
 
 
+@pytest.mark.slow
 def test_a_scene_that_shares_no_context_is_rendered_plainly(caplog: pytest.LogCaptureFixture) -> None:
     endless = SCENE.replace("</worldbody>", '<geom type="plane" size="0 0 1" pos="0 0 -1" group="1"/></worldbody>')
     with closing(Renderer(endless)) as renderer:
@@ -79,6 +82,7 @@ def test_a_scene_that_shares_no_context_is_rendered_plainly(caplog: pytest.LogCa
     assert "an unbounded floor" in record.getMessage()
 
 
+@pytest.mark.slow
 def test_other_pixels_of_the_small_scene_force_plain_rendering(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -96,6 +100,7 @@ def test_other_pixels_of_the_small_scene_force_plain_rendering(
     assert "frames of a small scene have other pixels" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_variable_forces_plain_and_imports_none_of_the_savings() -> None:
     program = f"""
 import sys
@@ -107,6 +112,7 @@ print(type(Renderer({SCENE!r}).model_renderer).__name__, [name for name in sys.m
     assert (done.stdout.strip(), done.stderr) == ("PlainRenderer []", "")
 
 
+@pytest.mark.slow
 def test_without_the_folder_of_savings_scenes_are_rendered_plainly(tmp_path: Path) -> None:
     for folder in ("pipeline", "schemas"):
         shutil.copytree(REPOSITORY / folder, tmp_path / folder, ignore=shutil.ignore_patterns("software"))

@@ -186,6 +186,7 @@ class FaceRenderer:
         self._renderer.close()
 
 
+@pytest.mark.slow
 def test_faces_that_turn_around_are_rendered_where_opengl_does_so_of_the_whole_mesh() -> None:
     """In a batch with a corner outside of the view, OpenGL sorts out what faces away before it rounds corners."""
     rng, turning = seeding.rng("test_skins", "batches"), turning_faces()
@@ -251,6 +252,7 @@ def scene(shadows: bool) -> str:
     </mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shadows", [False, True], ids=["lights", "shadows"])
 def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
     rng, rendered = seeding.rng("test_skins", "moves"), []
@@ -274,6 +276,7 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
     assert np.max(rendered) < 0.6 * whole, "half of the faces are on the other side"
 
 
+@pytest.mark.slow
 def test_display_lists_may_be_numbered_downwards(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mesa 22 counts on, Mesa 25 fills gaps, so that a later block may have lower numbers."""
     gl.prepare()

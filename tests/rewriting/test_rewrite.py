@@ -214,6 +214,7 @@ def test_only_the_sentences_of_an_answer_are_read(server: Server, tmp_path: Path
     assert held(bank)[CLASSES[0]] == [GOOD]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "answer", ["I'm sorry, I cannot help with that", "please light the stove", "", "[]", '{"a": 1}', "[" * 5000]
 )
@@ -236,6 +237,7 @@ def test_wrong_counts_are_made_up_for_and_surplus_is_left(server: Server, tmp_pa
     ]
 
 
+@pytest.mark.slow
 def test_busy_and_broken_endpoints_are_asked_again(server: Server, tmp_path: Path) -> None:
     good = lists(1, 1, 1, 1)
     trouble: list[list[Reply]] = [

@@ -54,6 +54,7 @@ def test_sets_of_the_run_are_no_foreign_ones(tmp_path: Path) -> None:
     assert [path.name for path in renamed.folder.iterdir()] == ["other_spatial"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [write_rlds, write_lerobot, write_lerobot_v21])
 @pytest.mark.parametrize("content", ["first", "second"], ids=["nothing to do", "another dataset to write"])
 def test_a_file_inside_a_set_is_rejected_and_stays(content: str, write: Any, tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ def test_the_limits_are_those_of_the_evaluation() -> None:
     assert exceeds_step_limit("mine", 10_000) is None
 
 
+@pytest.mark.slow
 def test_the_wine_bottle_is_marked_and_reported(replayed: tuple[Row, TrajectoryStore]) -> None:
     row, store = replayed
     verdicts = verdicts_of(store.rows(), [row], FilterConfig())

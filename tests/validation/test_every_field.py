@@ -136,6 +136,7 @@ def brighter(value: Any) -> Any:
     return (np.array(value) + 0.15).tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "at", "change", "what"),
     [
@@ -183,6 +184,7 @@ def test_a_changed_deviation_is_found_in_sampled_frames(factor: float, written: 
     assert [text.startswith(f"std of {IMAGE} is") for text in texts] == [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["episode_id", "suite", "axis", "component", "level"])
 def test_a_changed_label_by_which_users_select_is_found(column: str, written: Path, tmp_path: Path) -> None:
     dataset = opened("lerobot", written, tmp_path)
@@ -305,6 +307,7 @@ def test_a_changed_path_of_the_demonstration_in_rlds_is_found(written: Path, tmp
     assert found(dataset, tmp_path) == [f"file_path is '{'x' * len(path)}'"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lerobot", "rlds"])
 def test_a_demonstration_in_both_splits_is_found(name: str, tmp_path: Path) -> None:
     """Written with each episode as a demonstration of its own, where it is said that two are of one."""
