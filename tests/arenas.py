@@ -6,7 +6,7 @@ from contextlib import closing, contextmanager
 from functools import cache
 
 import numpy as np
-from conftest import MILK, STOVE, starter_demo
+from short_demonstrations import MILK, STOVE, starter_demo
 
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment

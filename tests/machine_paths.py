@@ -12,7 +12,7 @@ from zipfile import ZipFile
 import h5py
 import numpy as np
 import pyarrow.parquet as pq
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from PIL import Image
 
 from pipeline.formats.tfrecord import records

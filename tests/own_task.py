@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-from conftest import BOWL, REPOSITORY, link_testset, starter_demo
+from checkout import REPOSITORY, link_testset
+from short_demonstrations import BOWL, starter_demo
 
 from pipeline.config import ReplayConfig
 from pipeline.libero.starts import recorded_start

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import jsonschema
 import pytest
 import yaml
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from pydantic import BaseModel, ValidationError
 
 from pipeline.axes.background import BackgroundAxis

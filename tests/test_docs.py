@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from checkout import REPOSITORY
 from command_words import parse
-from conftest import REPOSITORY
 
 from pipeline.config import load
 

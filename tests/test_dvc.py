@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 
 from pipeline import stages
 from pipeline.config import load

@@ -4,7 +4,7 @@ import resource
 from pathlib import Path
 
 import pytest
-from conftest import limited
+from faults import limited
 
 from pipeline.files import keep_below, remove_leftovers, replaced
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 
 from pipeline import gl
 from pipeline.errors import PipelineError

@@ -3,7 +3,7 @@
 import json
 import re
 
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 
 from pipeline.catalogue import sweethome3d, texture_sources
 from pipeline.testset import benchmark

@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY, SCRIPTS
+from checkout import REPOSITORY, SCRIPTS
 
 from pipeline.machine_code import FIXED, MACHINE_CODE_VARIABLES
 
@@ -90,7 +90,11 @@ def test_every_program_of_this_project_starts_itself_with_the_variables() -> Non
     programs = []
     for path in map(Path, files.stdout.split()):
         text = (REPOSITORY / path).read_text()
-        uses_project = re.search(r"^ *(from|import) (pipeline|conftest)\b", text, re.MULTILINE)
+        uses_project = re.search(
+            r"^ *(from|import) (pipeline|conftest|checkout|faults|short_demonstrations|short_runs)\b",
+            text,
+            re.MULTILINE,
+        )
         is_program = "__main__" in text and re.search(r'^if __name__ == "__main__":', text, re.MULTILINE)
         if uses_project and is_program and "templates" not in path.parts and not path.name.startswith("test_"):
             programs.append((path.stem, text))

@@ -17,9 +17,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import PLATE, REPOSITORY, tiny_config
+from checkout import REPOSITORY
 from machine_paths import told
 from PIL import Image
+from short_demonstrations import PLATE
+from short_runs import tiny_config
 
 from pipeline.catalogue import object_sources
 from pipeline.catalogue.object_model import ObjectModel

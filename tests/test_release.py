@@ -6,7 +6,7 @@ import tomllib
 from importlib.metadata import version
 
 import yaml
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 
 from pipeline.identity import DISTRIBUTION
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from conftest import BOWL
+from short_demonstrations import BOWL
 
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.episode_schema import STANDARD

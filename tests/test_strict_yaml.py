@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 

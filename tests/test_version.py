@@ -9,7 +9,8 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from conftest import BOWL, REPOSITORY, copy_of
+from checkout import REPOSITORY, copy_of
+from short_demonstrations import BOWL
 
 from pipeline.identity import DISTRIBUTION
 from pipeline.run import manifest

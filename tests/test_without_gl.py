@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import REPOSITORY, STOVE, link_testset, tiny_config
+from checkout import REPOSITORY, link_testset
+from short_demonstrations import STOVE
+from short_runs import tiny_config
 
 from pipeline import gl
 

@@ -22,9 +22,12 @@ import pytest
 import results
 import sentences
 import yaml
-from conftest import REPOSITORY, STOVE, link_testset, memory, once, short_demos, tiny_config, whole  # noqa: F401
+from checkout import REPOSITORY, link_testset
+from conftest import memory, once, short_demos, whole  # noqa: F401
 from experiment import Experiment, read
 from instructions import every_instruction, find_tasks, goals_in
+from short_demonstrations import STOVE
+from short_runs import tiny_config
 from states import relative_by_episode
 
 from pipeline.__main__ import main

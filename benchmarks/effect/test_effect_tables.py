@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import results
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from episode_results import result
 from scipy.stats import permutation_test
 

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 from arenas import TASKS, change, changed, checksums, frames
-from conftest import MILK, REPOSITORY
+from checkout import REPOSITORY
+from short_demonstrations import MILK
 
 from pipeline.axes import RenderPerturbation
 from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering, skin_of

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pytest
-from conftest import MILK
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
+from short_demonstrations import MILK
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.camera import PARAMETERS, CameraAxis, CameraPerturbation

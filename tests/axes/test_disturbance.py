@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import BOWL, starter_demo
+from short_demonstrations import BOWL, starter_demo
 
 from pipeline.axes import Axes
 from pipeline.axes.disturbance import DisturbanceAxis, DisturbancePerturbation

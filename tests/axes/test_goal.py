@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import starter_demo
 from libero.libero.envs.bddl_utils import robosuite_parse_problem
+from short_demonstrations import starter_demo
 
 from pipeline.axes import Axes, from_json, task_of, to_json
 from pipeline.axes.goal import GoalAxis, GoalPerturbation, held_out_pairs, level_of_pair, pairs, usable

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError

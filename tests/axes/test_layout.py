@@ -8,7 +8,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from conftest import MILK, PLATE, REPOSITORY, STOVE, starter_demo
+from checkout import REPOSITORY
+from short_demonstrations import MILK, PLATE, STOVE, starter_demo
 
 from pipeline import seeding
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation

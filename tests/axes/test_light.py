@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from arenas import TASKS, change, changed, checksums, frames
-from conftest import MILK
+from short_demonstrations import MILK
 
 from pipeline.axes.base import Level
 from pipeline.axes.light import TILT_AZIMUTH_DEG, Component, LightAxis, LightPerturbation, exposure

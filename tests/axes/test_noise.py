@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import skimage.data
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

@@ -9,8 +9,8 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from conftest import MILK, PLATE, STOVE, starter_demo
 from scipy.spatial.transform import Rotation
+from short_demonstrations import MILK, PLATE, STOVE, starter_demo
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.base import Level

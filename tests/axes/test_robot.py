@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import MILK, PLATE, starter_demo
 from scipy.spatial.transform import Rotation
+from short_demonstrations import MILK, PLATE, starter_demo
 
 from pipeline.axes.report_data import BENCHMARK, Histogram, Strips
 from pipeline.axes.robot import RobotAxis, RobotPerturbation, benchmark_offsets_rad

@@ -29,9 +29,10 @@ if __name__ == "__main__":  # run as a script: with what the tests share
 
 
 import numpy as np
-from conftest import REPOSITORY, STOVE, starter_demo
+from checkout import REPOSITORY
 from episode_results import result
 from PIL import Image
+from short_demonstrations import STOVE, starter_demo
 from synthetic import write_rlds
 
 from pipeline.axes.language import BANK_FILE, load_bank

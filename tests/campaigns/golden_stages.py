@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from conftest import STOVE
+from short_demonstrations import STOVE
 from synthetic import IDS, episode, files, write_format, write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.episode_schema import SCHEMA, labels_of

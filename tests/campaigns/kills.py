@@ -31,7 +31,7 @@ if __name__ == "__main__":  # run as a script: with what the tests share
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
 import psutil
-from conftest import IN_SCRIPTS, in_a_clone
+from checkout import IN_SCRIPTS, in_a_clone
 
 from pipeline.machine_code import ensure_fixed_machine_code
 

@@ -16,8 +16,10 @@ from pathlib import Path
 if __name__ == "__main__":  # run as a script: with what the tests share
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
-from conftest import STOVE, in_a_clone, loaded_whole, replay_whole, run_pipeline, tiny_config, write_short_demos
+from checkout import in_a_clone, run_pipeline
 from kills import COMPUTE_FILES, compared
+from short_demonstrations import STOVE, loaded_whole, replay_whole, write_short_demos
+from short_runs import tiny_config
 
 from pipeline.machine_code import ensure_fixed_machine_code
 

@@ -24,8 +24,9 @@ from typing import Any
 if __name__ == "__main__":  # run as a script: with what the tests share
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
-from conftest import IN_SCRIPTS, STAGES, in_a_clone
+from checkout import IN_SCRIPTS, in_a_clone
 from kills import STARTER, compared
+from short_runs import STAGES
 
 from pipeline.machine_code import ensure_fixed_machine_code
 

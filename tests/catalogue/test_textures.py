@@ -13,9 +13,10 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
-from conftest import REPOSITORY, STOVE
+from checkout import REPOSITORY
 from libero.libero import get_libero_path
 from numpy.typing import NDArray
+from short_demonstrations import STOVE
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.background import BackgroundAxis

@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 from accelerate import Accelerator
-from conftest import datasets_in
+from short_runs import datasets_in
 from tiny_recipe import ROWS, export_config, row, tiny_recipe
 from torch.utils.data import DataLoader, Dataset
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import datasets_in
+from short_runs import datasets_in
 
 from pipeline.clients.recipe import build, write
 from pipeline.clients.templates.run_openvla_oft import mixed

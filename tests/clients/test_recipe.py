@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 from command_words import parse
-from conftest import datasets_in
+from short_runs import datasets_in
 from synthetic import IDS, SET, TASK, episode, write_hdf5, write_lerobot_v21
 from tiny_recipe import NAME, ROWS, SUITES, export_config, row, tiny_recipe
 from vla_eval.model_servers.base import ModelServer

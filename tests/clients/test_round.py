@@ -16,11 +16,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from conftest import BOWL, SHORT, datasets_in, starter_demo
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.factory import make_pre_post_processors
+from short_demonstrations import BOWL, SHORT, starter_demo
+from short_runs import datasets_in
 from synthetic import IDS, NAME, SET, episode, loop
 
 from pipeline.clients import oft, recipe

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import datasets_in
+from short_runs import datasets_in
 from tiny_recipe import NAME, SUITES, export_config, row, tiny_recipe
 
 from pipeline.clients.recipe import write

@@ -18,8 +18,10 @@ from typing import Any
 import click
 import pytest
 import yaml
+from checkout import IN_SCRIPTS, REPOSITORY, SCRIPTS, dvc
 from command_words import commands, parse
-from conftest import IN_SCRIPTS, REPOSITORY, SCRIPTS, dvc, rot, tiny_config
+from faults import rot
+from short_runs import tiny_config
 
 from pipeline import stages
 from pipeline.__main__ import main

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 
 from pipeline.errors import PipelineError
 from pipeline.exit_status import SURROUNDINGS, exit_status

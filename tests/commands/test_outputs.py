@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY, STOVE
+from checkout import REPOSITORY
 from episode_results import result
 from PIL import Image
+from short_demonstrations import STOVE
 
 from pipeline import __main__ as command_line
 from pipeline.evaluation.results import EpisodeFiles

@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import REPOSITORY, STOVE, link_testset, tiny_config
+from checkout import REPOSITORY, link_testset
 from PIL import Image
+from short_demonstrations import STOVE
+from short_runs import tiny_config
 
 from pipeline import gl
 from pipeline.axes import Axes

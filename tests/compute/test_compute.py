@@ -13,6 +13,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from checkout import REPOSITORY
 from compute_work import (
     BLOCK_BYTES,
     DieOrHangJob,
@@ -25,7 +26,6 @@ from compute_work import (
     reject_two,
     square,
 )
-from conftest import REPOSITORY
 from distributed import LocalCluster, Nanny
 
 from pipeline import gl

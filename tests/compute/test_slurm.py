@@ -14,7 +14,7 @@ from pathlib import Path
 import dask
 import pytest
 import yaml
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from distributed import Client
 from pydantic import ValidationError
 

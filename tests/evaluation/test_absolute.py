@@ -4,8 +4,8 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from conftest import STOVE, starter_demo
 from scipy.spatial.transform import Rotation
+from short_demonstrations import STOVE, starter_demo
 
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.selection import Selection, select

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import STOVE
 from libero.libero import get_libero_path
+from short_demonstrations import STOVE
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus

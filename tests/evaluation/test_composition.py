@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import PLATE, starter_demo
+from short_demonstrations import PLATE, starter_demo
 
 from pipeline import seeding
 from pipeline.axes import AXES, Perturbation, PhysicsPerturbation, from_json, in_order, of_layer, to_json

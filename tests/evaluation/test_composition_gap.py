@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
-from conftest import STOVE
 from episode_results import analyze, result
+from short_demonstrations import STOVE
 
 from pipeline.axes import to_json
 from pipeline.errors import PipelineError

@@ -13,11 +13,12 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import REPOSITORY, STOVE
+from checkout import REPOSITORY
 from episode_results import result
 from libero_environment import OffScreenRenderEnv, transform
 from numpy.typing import NDArray
 from server_process import replaying
+from short_demonstrations import STOVE
 from vla_eval.rotation import matrix_to_quat, quat_to_axisangle
 
 from pipeline.__main__ import main

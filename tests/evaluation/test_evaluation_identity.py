@@ -12,9 +12,9 @@ import av
 import checkpoints
 import numpy as np
 import pytest
-from conftest import STOVE
 from episode_results import result
 from server_process import running
+from short_demonstrations import STOVE
 
 from pipeline import identity
 from pipeline.axes.camera import CameraAxis, SphericalRange

@@ -17,13 +17,14 @@ import numpy as np
 import pytest
 import websockets
 from anyio.from_thread import start_blocking_portal
-from conftest import REPOSITORY, STOVE
+from checkout import REPOSITORY
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from server_process import running
+from short_demonstrations import STOVE
 from vla_eval.model_servers.base import ModelServer
 from vla_eval.model_servers.groot import GR00TModelServer
 from vla_eval.model_servers.serve import serve_async

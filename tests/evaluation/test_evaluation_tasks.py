@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import STOVE
 from episode_results import result
 from libero.libero.benchmark import get_benchmark_dict
+from short_demonstrations import STOVE
 
 from pipeline import seeding
 from pipeline.axes import level_of_test

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import STOVE
 from episode_results import analyze, result
+from short_demonstrations import STOVE
 
 from pipeline.axes.goal import GoalPerturbation, held_out_pairs
 from pipeline.config import DemosConfig, ReplayConfig

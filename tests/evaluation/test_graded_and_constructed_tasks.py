@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from conftest import STOVE
 from episode_results import analyze, result
+from short_demonstrations import STOVE
 
 from pipeline.axes import AXES
 from pipeline.axes.camera import CameraAxis, SphericalRange

@@ -9,8 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from conftest import STOVE
 from episode_results import analyze, result
+from short_demonstrations import STOVE
 
 from pipeline.axes import Perturbation, to_json
 from pipeline.axes.camera import CameraPerturbation

@@ -9,9 +9,9 @@ from typing import Any
 import checkpoints
 import numpy as np
 import pytest
-from conftest import STOVE
 from lerobot.configs.parser import get_cli_overrides, parse_arg
 from libero_environment import OffScreenRenderEnv
+from short_demonstrations import STOVE
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment

@@ -10,8 +10,9 @@ from typing import Any
 
 import libero_environment  # noqa: F401 - robosuite with OpenGL, for the harness's classes
 import pytest
-from conftest import REPOSITORY, STOVE
+from checkout import REPOSITORY
 from server_process import running
+from short_demonstrations import STOVE
 from vla_eval.connection import Connection
 from vla_eval.runners.sync_runner import SyncEpisodeRunner
 

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from anyio.from_thread import start_blocking_portal
-from conftest import REPOSITORY, STOVE
+from checkout import REPOSITORY
 from server_process import running
+from short_demonstrations import STOVE
 from vla_eval.model_servers.base import ModelServer
 from vla_eval.model_servers.serve import serve_async
 

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import own_task
 import pytest
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from server_process import running
 
 from pipeline.commands.command_line import run as command

@@ -16,12 +16,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import tensorflow_datasets as tfds
-from conftest import datasets_in, link_testset, run_stages, tiny_config
+from checkout import link_testset
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
 from lerobot.datasets.factory import make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from short_runs import datasets_in, run_stages, tiny_config
 from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
 
 from pipeline.clients import recipe

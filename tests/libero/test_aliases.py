@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import starter_demo
+from short_demonstrations import starter_demo
 
 from pipeline.config import ReplayConfig
 from pipeline.libero import hdf5

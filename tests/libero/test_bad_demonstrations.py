@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import MILK, STOVE, starter_demo
+from short_demonstrations import MILK, STOVE, starter_demo
 
 from pipeline.axes import Axes
 from pipeline.axes.layout import LayoutAxis

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from conftest import BOWL, MILK, STOVE
+from short_demonstrations import BOWL, MILK, STOVE
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl

@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import served
+from faults import served
 
 from pipeline.errors import PipelineError
 from pipeline.libero import fetch as fetching

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import own_task
 import pytest
-from conftest import BOWL, REPOSITORY
+from checkout import REPOSITORY
+from short_demonstrations import BOWL
 
 from pipeline.axes.language import list_rewrites
 from pipeline.compute.pool import loop

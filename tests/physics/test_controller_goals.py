@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import STOVE, starter_demo
 from scipy.spatial.transform import Rotation
+from short_demonstrations import STOVE, starter_demo
 
 from pipeline.axes import PhysicsPerturbation
 from pipeline.axes.robot import RobotAxis

@@ -7,7 +7,7 @@ import arenas
 import mujoco
 import numpy as np
 import pytest
-from conftest import STOVE
+from short_demonstrations import STOVE
 
 from pipeline.errors import RejectedError
 from pipeline.libero.tasks import find_task

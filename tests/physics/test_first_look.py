@@ -6,8 +6,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import pytest
-from conftest import BOWL, MILK, STOVE, starter_demo
 from scipy.spatial.transform import Rotation
+from short_demonstrations import BOWL, MILK, STOVE, starter_demo
 
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.control_env import seeded

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import BOWL, PLATE, starter_demo
+from short_demonstrations import BOWL, PLATE, starter_demo
 
 from pipeline.config import ReplayConfig
 from pipeline.libero import bddl

@@ -12,9 +12,9 @@ from typing import Literal
 import h5py
 import numpy as np
 import pytest
-from conftest import BOWL, MILK, STOVE
 from hypothesis import given
 from hypothesis import strategies as st
+from short_demonstrations import BOWL, MILK, STOVE
 
 from pipeline.axes import Axes, PhysicsPerturbation
 from pipeline.compute.pool import loop

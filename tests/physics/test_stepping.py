@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from conftest import MILK, STOVE, starter_demo
+from short_demonstrations import MILK, STOVE, starter_demo
 
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task

@@ -8,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from conftest import BOWL, MILK, PLATE, STOVE, starter_demo
 from numpy.typing import NDArray
+from short_demonstrations import BOWL, MILK, PLATE, STOVE, starter_demo
 
 from pipeline.config import ReplayConfig
 from pipeline.libero import bddl

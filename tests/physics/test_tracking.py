@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import BOWL, MILK, STOVE, starter_demo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from short_demonstrations import BOWL, MILK, STOVE, starter_demo
 
 from pipeline.axes.base import PhysicsPerturbation
 from pipeline.axes.pose import PosePerturbation

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import MILK, REPOSITORY, starter_demo
+from checkout import REPOSITORY
+from short_demonstrations import MILK, starter_demo
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.pose import Move, PosePerturbation, ScenePerturbation

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import REPOSITORY, tiny_config
+from checkout import REPOSITORY
+from short_runs import tiny_config
 
 from pipeline import seeding
 from pipeline.axes import AXES, Perturbation, from_json, to_json

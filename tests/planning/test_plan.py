@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import REPOSITORY, read_with_flipped_bits
+from checkout import REPOSITORY
+from faults import read_with_flipped_bits
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chisquare

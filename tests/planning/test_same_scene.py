@@ -10,7 +10,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 
 from pipeline.axes.pose import PoseAxis, ScenePerturbation
 from pipeline.libero.tasks import find_task

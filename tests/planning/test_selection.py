@@ -1,6 +1,6 @@
 """A reserve takes the place of what is lost before it, and of nothing else."""
 
-from conftest import BOWL
+from short_demonstrations import BOWL
 
 from pipeline.axes import Axes, to_json
 from pipeline.axes.light import LightAxis

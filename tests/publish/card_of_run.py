@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 import pyarrow as pa
 import yaml
-from conftest import MILK, STOVE, run_in
 from huggingface_hub import DatasetCard
+from short_demonstrations import MILK, STOVE
+from short_runs import run_in
 
 from pipeline.axes import to_json
 from pipeline.axes.background import BackgroundAxis

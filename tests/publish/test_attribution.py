@@ -1,6 +1,6 @@
 """Who made what episodes show is told from the manifest alone, and the sources hold what the README promises."""
 
-from conftest import MILK
+from short_demonstrations import MILK
 
 from pipeline.axes import AXES, to_json
 from pipeline.axes.background import BackgroundAxis

@@ -23,7 +23,8 @@ from card_of_run import (
     write_rows,
     written,
 )
-from conftest import BOWL, MILK, STOVE, run_in
+from short_demonstrations import BOWL, MILK, STOVE
+from short_runs import run_in
 
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.pose import PoseAxis

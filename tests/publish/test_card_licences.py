@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from card_of_run import BACKGROUND, LAYOUT, ROWS, cells, metadata_of, row, write_files, write_rows, written
-from conftest import STOVE
+from short_demonstrations import STOVE
 
 from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.language import LanguagePerturbation, list_rewrites

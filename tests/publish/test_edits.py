@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 from card_of_run import NAME, metadata_of, write_files, written
-from conftest import IN_SCRIPTS, REPOSITORY, in_a_clone
+from checkout import IN_SCRIPTS, REPOSITORY, in_a_clone
 
 from pipeline.errors import PipelineError
 from pipeline.publish_config import PublishConfig

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 from card_of_run import metadata_of, row, write_files, write_rows, written
-from conftest import STOVE
 from pydantic import ValidationError
+from short_demonstrations import STOVE
 
 from pipeline.publish_config import PublishConfig
 

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import REPOSITORY as CHECKOUT
-from conftest import Once, served
+from checkout import REPOSITORY as CHECKOUT
+from conftest import Once
+from faults import served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from stand_in_hub import ATTRIBUTES, REPOSITORY, Hub, is_large
 from synthetic import SET, write_lerobot

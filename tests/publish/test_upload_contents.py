@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import REPOSITORY, Once, dvc, rot
+from checkout import REPOSITORY, dvc
+from conftest import Once
+from faults import rot
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from synthetic import SET
 from validated_run import NAME, RUN, prepare, write_card, write_run

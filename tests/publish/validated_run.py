@@ -6,7 +6,7 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from conftest import run_in
+from short_runs import run_in
 from synthetic import write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.config import Config

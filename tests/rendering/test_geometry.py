@@ -11,9 +11,11 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
-from conftest import BOWL, REPOSITORY, STOVE, tiny_config
+from checkout import REPOSITORY
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from short_demonstrations import BOWL, STOVE
+from short_runs import tiny_config
 
 sys.path.append(str(REPOSITORY / "examples"))
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 import pytest
-from conftest import MILK
+from short_demonstrations import MILK
 
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoiseAxis

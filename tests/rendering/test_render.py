@@ -9,8 +9,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from conftest import MILK, REPOSITORY, STOVE
+from checkout import REPOSITORY
 from libero_environment import OffScreenRenderEnv, transform
+from short_demonstrations import MILK, STOVE
 
 from pipeline import axes
 from pipeline.axes.camera import CameraPerturbation

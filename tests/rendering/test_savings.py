@@ -12,7 +12,7 @@ from pathlib import Path
 
 import mujoco
 import pytest
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 
 from pipeline import gl
 from pipeline.rendering import savings

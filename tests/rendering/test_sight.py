@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from arenas import TASKS
-from conftest import REPOSITORY, starter_demo
+from checkout import REPOSITORY
+from short_demonstrations import starter_demo
 
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.config import ReplayConfig

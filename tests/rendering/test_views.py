@@ -10,9 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
-from conftest import BOWL, STOVE, link_testset, run_stages, tiny_config
+from checkout import link_testset
 from libero_environment import OffScreenRenderEnv
 from numpy.typing import NDArray
+from short_demonstrations import BOWL, STOVE
+from short_runs import run_stages, tiny_config
 
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import ALL_VIEWS, SCHEMA, SIZE_PX

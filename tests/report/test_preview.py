@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 import numpy as np
 import pytest
 from arenas import TASKS
-from conftest import BOWL, MILK, PLATE, REPOSITORY, starter_demo
+from checkout import REPOSITORY
 from PIL import Image
+from short_demonstrations import BOWL, MILK, PLATE, starter_demo
 
 from pipeline import __main__ as command_line
 from pipeline.axes import AXES, Axes, Perturbation, PhysicsPerturbation, RenderPerturbation, components_of, to_json

@@ -12,10 +12,11 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from conftest import REPOSITORY, tiny_config
+from checkout import REPOSITORY
 from html_page import Page, needs_no_other_file, screenshot
 from numpy.typing import NDArray
 from PIL import Image
+from short_runs import tiny_config
 
 from pipeline.axes import AXES, Perturbation, to_json
 from pipeline.axes.base import Level

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import BOWL
+from short_demonstrations import BOWL
 from synthetic import IDS, episode
 
 from pipeline.axes import to_json

@@ -10,8 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from conftest import MILK, REPOSITORY
+from checkout import REPOSITORY
 from scipy.spatial.transform import Rotation
+from short_demonstrations import MILK
 
 from pipeline.axes import AXES, Axis, Perturbation, from_json
 from pipeline.axes.disturbance import DisturbancePerturbation

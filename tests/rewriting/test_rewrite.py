@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import served
+from faults import served
 
 from pipeline import __main__ as command_line
 from pipeline.axes.language import load_bank

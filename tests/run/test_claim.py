@@ -14,7 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import BOWL, REPOSITORY, STOVE, limited, link_testset, run_stages, starter_demo, tiny_config
+from checkout import REPOSITORY, link_testset
+from faults import limited
+from short_demonstrations import BOWL, STOVE, starter_demo
+from short_runs import run_stages, tiny_config
 
 from pipeline import __main__ as command_line
 from pipeline.config import Config

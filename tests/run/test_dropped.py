@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import run_stages
+from short_runs import run_stages
 
 from pipeline import status
 from pipeline.config import Config, load

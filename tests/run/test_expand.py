@@ -11,9 +11,10 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
-from conftest import STOVE, link_testset, starter_demo
+from checkout import link_testset
 from machine_paths import told
 from scipy.spatial.transform import Rotation
+from short_demonstrations import STOVE, starter_demo
 
 from pipeline import outputs
 from pipeline.__main__ import main

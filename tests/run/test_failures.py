@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import run_stages, tiny_config
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from short_runs import run_stages, tiny_config
 from synthetic import IDS, NAME, episode, episodes, loop
 
 from pipeline.config import load

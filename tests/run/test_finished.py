@@ -5,7 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import dvc, rot, run_in
+from checkout import dvc
+from faults import rot
+from short_runs import run_in
 from synthetic import episodes, write_rlds
 
 from pipeline import identity, stages

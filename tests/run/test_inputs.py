@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import STOVE, link_testset, run_in
+from checkout import link_testset
+from short_demonstrations import STOVE
+from short_runs import run_in
 
 from pipeline.run import inputs
 from pipeline.run.run import Run

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from conftest import BOWL
+from short_demonstrations import BOWL
 
 from pipeline.axes import Axes
 from pipeline.axes.noise import NoiseAxis

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import run_in
+from short_runs import run_in
 from synthetic import episode, episodes, files
 
 from pipeline.config import Config

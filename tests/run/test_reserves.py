@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import BOWL, copy_of, dvc, in_a_clone, run_stages, tiny_config
+from checkout import copy_of, dvc, in_a_clone
 from kills import contents
+from short_demonstrations import BOWL
+from short_runs import run_stages, tiny_config
 
 from pipeline import gl
 from pipeline.compute.pool import loop

@@ -17,9 +17,11 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 import yaml
-from conftest import REPOSITORY, SCRIPTS, STOVE, dvc, run_stages, tiny_config
+from checkout import REPOSITORY, SCRIPTS, dvc
 from dvc.repo import Repo  # type: ignore[import-untyped]
 from PIL import Image
+from short_demonstrations import STOVE
+from short_runs import run_stages, tiny_config
 from synthetic import records
 
 from pipeline import stages

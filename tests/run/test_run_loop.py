@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import IN_SCRIPTS, link_testset, run_pipeline, run_stages, tiny_config
+from checkout import IN_SCRIPTS, link_testset, run_pipeline
+from short_runs import run_stages, tiny_config
 
 from pipeline import stages
 from pipeline.run import manifest

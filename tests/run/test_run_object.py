@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
-from conftest import BOWL, run_in
+from short_demonstrations import BOWL
+from short_runs import run_in
 
 from pipeline.config import RenderConfig, ReplayConfig, load
 from pipeline.libero.demonstrations import DemoEntry

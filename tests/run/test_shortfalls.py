@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import STAGES, run_stages
+from short_runs import STAGES, run_stages
 
 from pipeline import status
 from pipeline.config import load

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import run_in
+from short_runs import run_in
 
 from pipeline.run.cleaning import found, say_stale
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from conftest import BOWL, tiny_config
+from short_demonstrations import BOWL
+from short_runs import tiny_config
 
 from pipeline.compute.pool import loop
 from pipeline.config import Config

@@ -19,7 +19,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from bowl import bowl_config, bowl_plan, given_up, nothing_to_do, replay_bowl
-from conftest import Once, limited, read_with_flipped_bits, run_in
+from conftest import Once
+from faults import limited, read_with_flipped_bits
+from short_runs import run_in
 
 from pipeline.compute.pool import loop
 from pipeline.config import Config, FilterConfig

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import h5py
 import pytest
-from conftest import BOWL, REPOSITORY, link_testset
+from checkout import REPOSITORY, link_testset
 from libero.libero.benchmark import task_maps
+from short_demonstrations import BOWL
 
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError

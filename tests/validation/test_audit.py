@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from conftest import REPOSITORY
+from checkout import REPOSITORY
 from libero.libero.envs import TASK_MAPPING
 from scipy.spatial.transform import Rotation
 from synthetic import IDS, NAME, episode, loop, records

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from conftest import BOWL, run_in
 from numpy.typing import NDArray
+from short_demonstrations import BOWL
+from short_runs import run_in
 from synthetic import IDS, episode
 
 from pipeline.axes import Axes, to_json

@@ -11,8 +11,10 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from conftest import BOWL, STOVE, link_testset, starter_demo, tiny_config
+from checkout import link_testset
 from pydantic import ValidationError
+from short_demonstrations import BOWL, STOVE, starter_demo
+from short_runs import tiny_config
 
 from pipeline.compute.pool import loop
 from pipeline.config import Config, DemosConfig, ReplayConfig

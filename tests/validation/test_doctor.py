@@ -8,7 +8,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from conftest import BOWL, MILK, REPOSITORY, STOVE, link_testset, run_in, tiny_config
+from checkout import REPOSITORY, link_testset
+from short_demonstrations import BOWL, MILK, STOVE
+from short_runs import run_in, tiny_config
 
 from pipeline import __main__ as command_line
 from pipeline import gl, stages

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import BOWL, REPOSITORY
+from checkout import REPOSITORY
+from short_demonstrations import BOWL
 
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import Config, load

@@ -11,7 +11,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import BOWL, REPOSITORY
+from checkout import REPOSITORY
+from short_demonstrations import BOWL
 
 from pipeline.__main__ import main
 from pipeline.errors import PipelineError

@@ -13,7 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import BOWL, MILK, STOVE, rot, run_stages, starter_demo, tiny_config
+from faults import rot
+from short_demonstrations import BOWL, MILK, STOVE, starter_demo
+from short_runs import run_stages, tiny_config
 
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.compute.pool import loop

@@ -5,7 +5,7 @@ from contextlib import chdir
 from pathlib import Path
 
 import pytest
-from conftest import rot
+from faults import rot
 
 from pipeline.compute.pool import loop
 from pipeline.config import load
