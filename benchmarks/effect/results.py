@@ -135,7 +135,7 @@ def _reject_other_precision(others: Iterable[PolicyResults], policy: PolicyResul
                 f"{policy.arm} was trained in {policy.precision}, and {other.arm} in {other.precision}, under the same "
                 "seed",
                 where=where,
-                remedy="train both on processors of one kind",
+                remedy="train the one in bfloat16 again, as new trainings are in float32",
             )
 
 

@@ -3,8 +3,8 @@
 The policy is lerobot's, and is saved in lerobot's format. The frames are stored in memory; a step decodes nothing. One
 thread computes, as several threads wait for each other. On two cores, train both seeds at the same time.
 
-The forward pass is in bfloat16 on processors with AVX-512, and in float32 on others. Without AVX-512, PyTorch has no
-fast convolution in bfloat16: a step of the experiment took 17 s of an AMD processor, and 0.8 s in float32.
+All of it is in float32, so that any machine can continue a training and policies of several machines can be compared.
+Processors without instructions for bfloat16 compute slower in it: twice to twenty times (benchmarks/LOG.md).
 """
 
 import json
@@ -13,7 +13,7 @@ import time
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +28,6 @@ from sentences import SIZE, Vectors, vector
 from states import relative_by_episode
 from torchvision.ops.misc import FrozenBatchNorm2d
 
-from pipeline.errors import PipelineError
 from pipeline.files import remove, replaced
 from pipeline.run.machine import host
 from pipeline.seeding import rng
@@ -84,12 +83,6 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
         policy.load_state_dict(saved["policy"])
         optimizer.load_state_dict(saved["optimizer"])
         step, log = saved["step"], saved["log"]
-        if saved["precision"] != precision():
-            raise PipelineError(
-                f"the training began in {saved['precision']}, and this processor continues in {precision()}",
-                where=work,
-                remedy="resume on a processor of the first kind, or move the folder away to begin again",
-            )
     policy.train()
     losses: list[float] = []
     wall, cpu = time.perf_counter(), time.process_time()
@@ -97,8 +90,7 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(step, config)
         batch = before(training.batch(rng("effect", "batch", seed, step), config.batch_size))
-        with torch.autocast("cpu", torch.bfloat16, enabled=precision() == "bfloat16"):
-            loss, _ = policy(batch)
+        loss, _ = policy(batch)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
         optimizer.step()
@@ -114,16 +106,8 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
             print(json.dumps(log[-1]), flush=True)
         if step % config.save_every == 0 or step == config.steps:
             with replaced(work / "last.pt") as temporary:
-                torch.save(
-                    {
-                        "policy": policy.state_dict(),
-                        "optimizer": optimizer.state_dict(),
-                        "step": step,
-                        "log": log,
-                        "precision": precision(),
-                    },
-                    temporary,
-                )
+                parts = {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
+                torch.save({**parts, "step": step, "log": log}, temporary)
     with replaced(out) as folder:
         for part in (policy, before, after):
             part.save_pretrained(folder)
@@ -134,18 +118,13 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
 
 
 def trained_with() -> dict[str, Any]:
-    """Return the versions of ``PACKAGES``, the models of this machine's processors, and the precision."""
+    """Return the versions of ``PACKAGES``, the models of this machine's processors, and the precision of trainings."""
     _, processors = host()
     return {
         "packages": {name: version(name) for name in PACKAGES},
         "processors": processors,
-        "precision": precision(),
+        "precision": "float32",
     }
-
-
-def precision() -> Literal["bfloat16", "float32"]:
-    """Return the precision of the forward pass on this machine."""
-    return "bfloat16" if torch.backends.cpu.get_cpu_capability() == "AVX512" else "float32"
 
 
 def configuration(experiment: Experiment) -> ACTConfig:
