@@ -452,7 +452,8 @@ def publish(folder: Path, docs: Path = DOCS, log: Path = LOG) -> str:
     _write(docs / "effect.md", "summary", summary())
     _write(docs / "effect.md", "table", text)
     _write(log, "experiment", markdown(read(folder)))
-    for further in sorted(FURTHER.iterdir()):
+    # A folder may have the plan of all arms before the results of a policy.
+    for further in sorted({file.parent for file in FURTHER.glob("*/*.json")}):
         if further.name != SHOWN:
             _write(log, further.name, markdown(_of_further(further.name)))
     return text

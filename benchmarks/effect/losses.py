@@ -10,6 +10,7 @@ frames together.
 import argparse
 import json
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import episodes
@@ -42,15 +43,15 @@ def main() -> None:
     before, _ = make_pre_post_processors(policy.config, str(folder))
     dataset = episodes.read(file)
     steps = Steps(experiment, dataset, sentences.read())
-    axes = np.repeat([row["axis"] for row in dataset.episodes], dataset.lengths)
+    axes, tasks = (np.repeat([row[column] for row in dataset.episodes], dataset.lengths) for column in ("axis", "task"))
     losses: dict[str, dict[str, float]] = {}
     for axis in sorted(set(axes)):
         sums: dict[str, list[float]] = defaultdict(list)
         generator = np.random.default_rng(0)
         frames = np.flatnonzero(axes == axis)
         for _ in range(BATCHES):
-            batch = steps.of_frames(generator.choice(frames, BATCH_SIZE))
-            for name, changed in variants(batch).items():
+            chosen = generator.choice(frames, BATCH_SIZE)
+            for name, changed in variants(steps.of_frames(chosen), tasks[chosen]).items():
                 with torch.inference_mode():
                     loss, _ = policy(before(changed))
                 sums[name].append(float(loss))
@@ -58,15 +59,31 @@ def main() -> None:
     print(json.dumps({"policy": f"{arm} {seed}", "episodes": arguments.episodes, "losses": losses}))
 
 
-def variants(batch: Batch) -> dict[str, Batch]:
-    """Return a batch as it is, with the sentence of another frame, and with black views."""
+def variants(batch: Batch, tasks: Sequence[str]) -> dict[str, Batch]:
+    """Return a batch as it is, with sentences of other tasks, and with black views.
+
+    Args:
+        batch: frames.
+        tasks: task of each frame, at least two different ones.
+    """
     black = {key: torch.zeros_like(batch[key]) for key in IMAGES.values()}
-    sentence = torch.roll(batch[SENTENCE], 1, dims=0)
+    sentence = batch[SENTENCE][next_of_other_tasks(tasks)]
     return {
         "as they are": dict(batch),
         "other sentence": {**batch, SENTENCE: sentence},
         "black views": {**batch, **black},
     }
+
+
+def next_of_other_tasks(tasks: Sequence[str]) -> list[int]:
+    """Return for each frame the place of the next frame of another task; the first frame follows the last one.
+
+    Args:
+        tasks: task of each frame, at least two different ones.
+    """
+    number = len(tasks)
+    following = [[(place + step) % number for step in range(1, number)] for place in range(number)]
+    return [next(other for other in after if tasks[other] != tasks[place]) for place, after in enumerate(following)]
 
 
 if __name__ == "__main__":

@@ -490,6 +490,12 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, mo
     assert all(bool((whole[name] == other[name]).all()) for name in whole)
 
 
+def test_another_sentence_is_that_of_the_next_frame_of_another_task() -> None:
+    import losses  # torch takes seconds to import
+
+    assert losses.next_of_other_tasks(["stove", "stove", "bowl", "plate", "stove"]) == [2, 2, 3, 4, 2]
+
+
 @pytest.fixture
 def command() -> Iterator[ModuleType]:
     """Yield the module of ``python benchmarks/effect``; this process keeps its environment for the next evaluation."""

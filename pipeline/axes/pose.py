@@ -30,7 +30,7 @@ from pipeline.axes.report_data import (
 )
 from pipeline.libero.arenas import ARENAS
 from pipeline.libero.carried import definition_of
-from pipeline.libero.task_goal import relation_holds
+from pipeline.libero.task_goal import instruction_holds
 from pipeline.libero.tasks import Same, find_task
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, Frozen, RollOut, Scene, Task
@@ -387,7 +387,7 @@ def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
             return False
     if not all(_within_reach(task, thing, place_m) for thing, place_m in xy_m.items()):
         return False
-    return all(relation_holds(task, target, xy_m.__getitem__) for target in definition.targets)
+    return instruction_holds(task, xy_m.__getitem__)
 
 
 def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:

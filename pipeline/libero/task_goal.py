@@ -10,10 +10,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.grouping import grouped
 from pipeline.libero.bddl import Bddl, Fact
 from pipeline.libero.carried import definition_of
 from pipeline.types import Floats, Task
@@ -44,6 +46,9 @@ NAMES = {
 SIDES = ("left", "right", "front", "back", "middle")
 """Words that distinguish things of one kind."""
 
+AXIS_OF_SIDE = {"front": 0, "back": 0, "left": 1, "right": 1}
+"""Side to the axis of the working surface along which it tells things apart: 0 for x, 1 for y."""
+
 INSIDE = {"cabinet": "drawer", "caddy": "compartment"}
 """Thing to the word for one of its parts."""
 
@@ -63,6 +68,12 @@ BETWEEN = 0.25
 """Share of the distance of two things that limits "between".
 
 A place nearer to either thing along the line, or farther off the line, is not between them.
+"""
+
+SIDE_SHARE = 0.25
+"""Share of the distance of two regions' centres that things of one noun keep, if the instruction names their side.
+
+The distance is measured along the axis of the side.
 """
 
 
@@ -295,8 +306,54 @@ def _anchors(task: Task, thing: str) -> tuple[str, ...]:
     return neighbours.things
 
 
-def relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:
-    """Return whether the target still stands in the place that the instruction names.
+def instruction_holds(task: Task, xy_m: Callable[[str], Floats]) -> bool:
+    """Return whether the instruction still describes the objects of the task.
+
+    Each target must stand in the place that the instruction names. If the instruction names a side, such as that of the
+    left bowl, objects with this noun must keep their order along the axis of the side.
+
+    Args:
+        task: the task.
+        xy_m: function that returns the position (2,) of an object.
+    """
+    targets = definition_of(task).targets
+    return all(_relation_holds(task, target, xy_m) for target in targets) and _sides_hold(task, xy_m)
+
+
+def _sides_hold(task: Task, xy_m: Callable[[str], Floats]) -> bool:
+    """Return whether objects that the instruction tells apart by their side keep their order, ``SIDE_SHARE`` apart."""
+    centres_m = definition_of(task).centres_m
+    for axis, names in _rows_of_namesakes(task):
+        for first, second in pairwise(names):
+            least_m = SIDE_SHARE * (centres_m[second][axis] - centres_m[first][axis])
+            if xy_m(second)[axis] - xy_m(first)[axis] < least_m:
+                return False
+    return True
+
+
+@cache
+def _rows_of_namesakes(task: Task) -> tuple[tuple[int, tuple[str, ...]], ...]:
+    """Return the objects that share a noun and have a side, in ascending order along the axis of the side.
+
+    Return no objects if the instruction names no side.
+
+    Returns:
+        Axis of the working surface, and names of objects.
+    """
+    scene = definition_of(task)
+    if not {*scene.language.split()} & {*SIDES}:
+        return ()
+    placed = [(_noun(kind), name) for name, kind in scene.objects.items() if name in scene.centres_m]
+    rows: list[tuple[int, tuple[str, ...]]] = []
+    for names in grouped(placed).values():
+        words = " ".join(describe_thing(scene, name) for name in names).split()
+        for axis in sorted({AXIS_OF_SIDE[word] for word in words if word in AXIS_OF_SIDE}):
+            rows.append((axis, tuple(sorted(names, key=lambda name: scene.centres_m[name][axis]))))
+    return tuple(rows)
+
+
+def _relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:
+    """Return whether the target still stands next to the thing, or between the things, that the instruction names.
 
     Next to a thing: within ``NEXT_TO_M`` of the thing, and no object of the target's category nearer to it. Between two
     things: projected onto the line between the things, the target is in the line's middle half. Its distance from the

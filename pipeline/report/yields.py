@@ -1,11 +1,12 @@
 """Tables of a run's planned episodes: the number of kept episodes, and the reasons for dropping the others."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS
+from pipeline.grouping import grouped
 from pipeline.run.counts import Counts, Diversity, Rows, Target, diversity, named, tally
 
 
@@ -33,6 +34,7 @@ def tables(tried: Rows) -> list[Table]:
     return [
         by_suite(tried),
         by_level("Kept/planned episodes, by level", tried),
+        by_demonstration(tried),
         _by_axis("Dropped episodes, by reason", [row for row in tried if not row["kept"]], "reason"),
         _by_axis("Kept episodes, by replay mode", [row for row in tried if row["kept"]], "replay_mode"),
     ]
@@ -86,6 +88,28 @@ def by_level(title: str, tried: Rows, axis: str | None = None) -> Table:
         by_levels = [_kept(Counts.of(rows_of_level[level])) for level in LEVELS]
         body.append((Cell(name), *by_levels))
     return Table(title, ("level", *map(str, LEVELS)), body)
+
+
+def by_demonstration(tried: Rows) -> Table:
+    """Tabulate the demonstrations of perturbed episodes by task: their numbers, and the largest share of one of them.
+
+    A reserve that replaces a failed episode may be of another demonstration. Demonstrations whose replays often fail
+    therefore have fewer kept episodes than planned ones.
+    """
+    body: list[tuple[Cell, ...]] = []
+    perturbed = [row for row in tried if row["role"] == "perturbed"]
+    for task, rows in grouped((f"{row['suite']}/{row['task']}", row) for row in perturbed).items():
+        planned = Counter(row["demo_id"] for row in rows)
+        wanted = Counter(row["demo_id"] for row in rows if row["wanted"])
+        kept = Counter(row["demo_id"] for row in rows if row["kept"])
+        number = Cell(f"{len(kept):,}/{len(planned):,}", len(kept) / len(planned))
+        body.append((Cell(task), number, _largest_share(wanted), _largest_share(kept)))
+    head = ("task", "demonstrations", "most planned from one", "most kept from one")
+    return Table("Demonstrations of kept/planned perturbed episodes, by task", head, body)
+
+
+def _largest_share(counts: Counter[str]) -> Cell:
+    return Cell(f"{max(counts.values()) / counts.total():.0%}".replace("%", " %") if counts else "-")
 
 
 def _kept(counts: Counts) -> Cell:

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from short_demonstrations import MILK, PLATE, STOVE, starter_demo
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.base import Level
-from pipeline.axes.pose import BASE_M, Move, PoseAxis, PosePerturbation, ScenePerturbation
+from pipeline.axes.pose import BASE_M, Move, PoseAxis, PosePerturbation, ScenePerturbation, sample_scene
 from pipeline.config import ReplayConfig
 from pipeline.errors import RejectedError
 from pipeline.libero import bddl
@@ -33,6 +33,12 @@ BETWEEN = find_task(
     "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
 )
 POTS = find_task("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove")
+BUTTER_AT_THE_BACK = find_task(
+    "libero_90", "KITCHEN_SCENE10_put_the_butter_at_the_back_in_the_top_drawer_of_the_cabinet_and_close_it"
+)
+BOOK_IN_THE_MIDDLE = find_task(
+    "libero_90", "STUDY_SCENE4_pick_up_the_book_in_the_middle_and_place_it_on_the_cabinet_shelf"
+)
 ON_STOVE = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_stove_and_place_it_on_the_plate")
 BOWL = "akita_black_bowl_1"
 SUITES = ("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*")
@@ -132,6 +138,8 @@ def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
         (BETWEEN, moved(BOWL, 0.06), "object_in_collision"),
         (NEXT_TO, moved(BOWL, -0.03, 0.05), "relation_broken"),
         (BETWEEN, moved(BOWL, 0.0, 0.08), "relation_broken"),
+        # It becomes the butter at the front.
+        (BUTTER_AT_THE_BACK, moved("butter_2", 0.13, -0.08), "relation_broken"),
         # Off the box, and let go in the air.
         (COOKIES, moved(BOWL, -0.08), "object_in_collision"),
     ],
@@ -159,6 +167,32 @@ def test_a_receptacle_moves_when_asked_for_and_the_targets_relation_still_holds(
 def test_small_moves_keep_the_relation(task: Task, scenes: Scenes) -> None:
     for change in (moved(BOWL, 0.01, -0.01, 4), moved(BOWL, -0.01, 0.01, -4)):
         change.apply(scenes(task), starter_demo(task), roll_out)
+
+
+@pytest.mark.parametrize(
+    ("task", "axis", "ascending", "nearer"),
+    [
+        (BUTTER_AT_THE_BACK, 0, ("butter_2", "butter_1"), 0.05),
+        (BOOK_IN_THE_MIDDLE, 1, ("yellow_book_2", "black_book_1", "yellow_book_1"), 0.05),
+    ],
+    ids=["back", "middle"],
+)
+def test_things_keep_the_side_that_the_instruction_names(
+    task: Task, axis: int, ascending: tuple[str, ...], nearer: float
+) -> None:
+    """In a demonstration in which the first of them already stands ``nearer`` to the second by this distance in m."""
+    centres_m, _ = centres_in_file(task)
+    source = {ascending[0]: (nearer, 0.0) if axis == 0 else (0.0, nearer)}
+    margins_m = []
+    for number in range(80):
+        scene = sample_scene(rng(2, number), 5, task, {}, source)
+        places_m = {
+            name: centres_m[name] + np.add(source.get(name, (0.0, 0.0)), scene.shifts[name]) for name in ascending
+        }
+        for first, second in pairwise(ascending):
+            before_m = centres_m[second][axis] - centres_m[first][axis]
+            margins_m.append(places_m[second][axis] - places_m[first][axis] - before_m / 4)
+    assert -1e-9 <= min(margins_m) < 0.01, "some come as near as they may"
 
 
 def test_a_plate_may_stand_near_the_edge_of_the_table(scenes: Scenes) -> None:

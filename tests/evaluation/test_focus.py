@@ -266,10 +266,16 @@ def test_goals_count_for_the_task_that_was_asked_for(tmp_path: Path) -> None:
     for task in listed:
         EpisodeFiles(tmp_path).save(result(task, episode=digest(task.name)[:16]))
     counted = attempts([tmp_path])
-    assert 0 < len(counted) == len(carried) < len(listed)
+    assert 0 < len(carried) < len(counted) == len(listed)
     assert Counter(episode.task for episode in counted) == Counter(
-        f"{task.suite}/{task.name.split('_task_')[1].split('_state')[0]}" for task in carried
+        f"{task.suite}/{task.name.split('_task_')[1].split('_state')[0]}" if task in carried else "" for task in listed
     )
+    config = Config.model_validate(
+        {"name": "goals", "demos": {"tasks": ["libero_spatial/*", "libero_10/*"]}}
+        | {"plan": {"axes": {"goal": {}}, "episodes": {"goal": 4}}}
+    )
+    focused = focus(config, counted, None)
+    assert sum(focused.policies.values()) + focused.left_out == len(listed), "all results are counted or named"
     assert all(episode.axes == ("goal",) for episode in counted)
 
 

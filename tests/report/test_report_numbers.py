@@ -22,9 +22,10 @@ from pipeline.types import Floats
 def row(name: str, axis: str, steps: int | None, **other: Any) -> dict[str, Any]:
     """Of an episode on a trajectory of its own."""
     known = {"suite": BOWL.suite, "task": BOWL.name, "chosen": True, "kept": True, "reason": "kept"}
-    known |= {"perturbations": "[]", "replay_mode": "open_loop", "instruction": BOWL.instruction}
+    known |= {"perturbations": "[]", "replay_mode": "open_loop", "instruction": BOWL.instruction, "wanted": True}
     role = "twin" if axis == "clean" else "perturbed"
     ids = {"episode_id": name, "trajectory_id": name, "twin_id": "twin", "actions_sha256": f"actions of {name}"}
+    ids |= {"demo_id": "demonstration"}
     return {**known, **ids, "axis": axis, "role": role, "steps": steps, **other}
 
 
@@ -56,6 +57,19 @@ def test_action_sequences_are_counted_by_task() -> None:
         [f"{BOWL.suite}/another", "1", "1", "0"],
         [str(BOWL), "3", "2", "3"],
         ["all", "4", "3", "3"],
+    ]
+
+
+def test_replacements_from_other_demonstrations_are_shown() -> None:
+    """Two of each demonstration are wanted; those of the second one fail, and a reserve of the first replaces one."""
+    planned = [row(f"{demo}{number}", "robot", 9, demo_id=demo, wanted=True) for demo in "ab" for number in range(2)]
+    planned += [row("spare", "robot", 9, demo_id="a", wanted=False), row("twin", "clean", 9, demo_id="b", wanted=True)]
+    planned.append(row("other", "robot", 9, demo_id="c", wanted=True, task="another"))
+    lost = ("b0", "b1", "other")
+    table = yields.by_demonstration([one | {"kept": one["episode_id"] not in lost} for one in planned])
+    assert [[cell.text for cell in line] for line in table.rows] == [
+        [str(BOWL), "1/2", "50 %", "100 %"],
+        [f"{BOWL.suite}/another", "0/1", "100 %", "-"],
     ]
 
 

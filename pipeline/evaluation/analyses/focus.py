@@ -55,7 +55,7 @@ class Attempt(NamedTuple):
         policy: name of the policy.
         axes: perturbed axes; empty for LIBERO's own tasks.
         level: strength, 1 to 5; 0 if it is unknown, and for several axes.
-        task: suite/name of the LIBERO task that the policy was asked for.
+        task: suite/name of the LIBERO task that the policy was asked for; empty if no plan can train its goal.
         failed: True if the goal was not reached.
     """
 
@@ -146,7 +146,7 @@ def attempts(paths: Sequence[Path]) -> list[Attempt]:
         settings = evaluated.settings
         if settings.get("black", "none") != "none" or settings.get("prompt") == "blank":
             raise _without_observation(evaluated.name, folders)
-        listed += filter(None, (_attempt(evaluated.name, row) for row in evaluated.rows))
+        listed += [_attempt(evaluated.name, row) for row in evaluated.rows]
     for policy in policies:
         if policy.black != "none" or "blank" in (policy.prompt or ""):
             raise _without_observation(policy.name, paths)
@@ -164,16 +164,13 @@ def _without_observation(name: str, paths: Sequence[Path]) -> PipelineError:
     )
 
 
-def _attempt(policy: str, row: EpisodeResult) -> Attempt | None:
-    """Return the attempt of a result; ``None`` for the source ``goals`` if no plan can train its goal."""
+def _attempt(policy: str, row: EpisodeResult) -> Attempt:
+    """Return the attempt of a result."""
     if row.source == "libero_plus":
         return _attempt_on_test(policy, row)
     task = f"{row.suite}/{row.base}"
     if row.source == "goals":
-        carried = find_carried_task(row)
-        if carried is None:
-            return None
-        task = str(carried)
+        task = str(find_carried_task(row) or "")
     axes = () if row.axis == "clean" else tuple(row.axis.split("+"))
     return Attempt(policy, axes, row.level if len(axes) == 1 else 0, task, not row.success)
 
