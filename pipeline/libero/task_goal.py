@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -324,9 +324,10 @@ def _sides_hold(task: Task, xy_m: Callable[[str], Floats]) -> bool:
     """Return whether objects that the instruction tells apart by their side keep their order, ``SIDE_SHARE`` apart."""
     centres_m = definition_of(task).centres_m
     for axis, names in _rows_of_namesakes(task):
-        for first, second in pairwise(names):
-            least_m = SIDE_SHARE * (centres_m[second][axis] - centres_m[first][axis])
-            if xy_m(second)[axis] - xy_m(first)[axis] < least_m:
+        for first, second in combinations(names, 2):
+            before_m = centres_m[second][axis] - centres_m[first][axis]
+            # Things at one place along the axis are not told apart by it.
+            if before_m > 0 and xy_m(second)[axis] - xy_m(first)[axis] < SIDE_SHARE * before_m:
                 return False
     return True
 
