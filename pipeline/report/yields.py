@@ -104,8 +104,8 @@ def by_demonstration(tried: Rows) -> Table:
         kept = Counter(row["demo_id"] for row in rows if row["kept"])
         number = Cell(f"{len(kept):,}/{len(planned):,}", len(kept) / len(planned))
         body.append((Cell(task), number, _largest_share(wanted), _largest_share(kept)))
-    head = ("task", "demonstrations", "most planned from one", "most kept from one")
-    return Table("Demonstrations of kept/planned perturbed episodes, by task", head, body)
+    head = ("task", "kept/planned", "share planned", "share kept")
+    return Table("Demonstrations of perturbed episodes, and the largest share of one, by task", head, body)
 
 
 def _largest_share(counts: Counter[str]) -> Cell:
