@@ -12,11 +12,7 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import fetch_testset
 
 REPOSITORY = Path(__file__).parent.parent
-
-
 SCRIPTS = Path(sys.executable).parent
-
-
 IN_SCRIPTS = {**os.environ, "PATH": f"{SCRIPTS}{os.pathsep}{os.environ['PATH']}"}
 """Environment variables for DVC, whose stages call `python`."""
 

@@ -43,7 +43,8 @@ def main() -> None:
     before, _ = make_pre_post_processors(policy.config, str(folder))
     dataset = episodes.read(file)
     steps = Steps(experiment, dataset, sentences.read())
-    axes, tasks = (np.repeat([row[column] for row in dataset.episodes], dataset.lengths) for column in ("axis", "task"))
+    axes = np.repeat([row["axis"] for row in dataset.episodes], dataset.lengths)
+    tasks = np.repeat([row["task"] for row in dataset.episodes], dataset.lengths)
     losses: dict[str, dict[str, float]] = {}
     for axis in sorted(set(axes)):
         sums: dict[str, list[float]] = defaultdict(list)
@@ -79,11 +80,20 @@ def next_of_other_tasks(tasks: Sequence[str]) -> list[int]:
     """Return for each frame the place of the next frame of another task; the first frame follows the last one.
 
     Args:
-        tasks: task of each frame, at least two different ones.
+        tasks: task of each frame.
+
+    Raises:
+        ValueError: if all frames are of one task.
     """
-    number = len(tasks)
-    following = [[(place + step) % number for step in range(1, number)] for place in range(number)]
-    return [next(other for other in after if tasks[other] != tasks[place]) for place, after in enumerate(following)]
+    if len({*tasks}) == 1:
+        raise ValueError(f"all frames are of the task {tasks[0]}, so there is no other sentence")
+    places: list[int] = []
+    for place, task in enumerate(tasks):
+        other = place
+        while tasks[other] == task:
+            other = (other + 1) % len(tasks)
+        places.append(other)
+    return places
 
 
 if __name__ == "__main__":

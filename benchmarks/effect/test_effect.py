@@ -484,6 +484,10 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, mo
     monkeypatch.setattr(training, "learning_rate", stopped)
     with pytest.raises(StoppedError):
         training.train(experiment, 0, numbered(), vectors, tmp_path / "stopped")
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "PRECISION", "another precision")
+        with pytest.raises(PipelineError, match="began in float32, and continues in another precision"):
+            training.train(experiment, 0, numbered(), vectors, tmp_path / "stopped")
     training.train(experiment, 0, numbered(), vectors, tmp_path / "stopped")
     assert taken == [0, 1, 2, 3, 2, 3], "from the checkpoint after two steps"
     whole, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "stopped"))

@@ -4,7 +4,7 @@ The policy is lerobot's, and is saved in lerobot's format. The frames are stored
 thread computes, as several threads wait for each other. On two cores, train both seeds at the same time.
 
 All of it is in float32, so that any machine can continue a training and policies of several machines can be compared.
-Processors without instructions for bfloat16 compute slower in it: twice to twenty times (benchmarks/LOG.md).
+Processors without instructions for bfloat16 take two to twenty times as long in bfloat16 (benchmarks/LOG.md).
 """
 
 import json
@@ -28,6 +28,7 @@ from sentences import SIZE, Vectors, vector
 from states import relative_by_episode
 from torchvision.ops.misc import FrozenBatchNorm2d
 
+from pipeline.errors import PipelineError
 from pipeline.files import remove, replaced
 from pipeline.run.machine import host
 from pipeline.seeding import rng
@@ -45,6 +46,9 @@ CALIBRATION_FRAMES = 64
 """Number of frames that set the backbone's normalisation."""
 
 LOG_EVERY = 50
+
+PRECISION = "float32"
+"""Precision of trainings; checkpoints and results before 1 December 2026 may have bfloat16."""
 
 PROPRIOCEPTION = "proprioception.json"
 """File of a policy with the value of this setting, which its server needs."""
@@ -83,6 +87,12 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
         policy.load_state_dict(saved["policy"])
         optimizer.load_state_dict(saved["optimizer"])
         step, log = saved["step"], saved["log"]
+        if saved["precision"] != PRECISION:
+            raise PipelineError(
+                f"the training began in {saved['precision']}, and continues in {PRECISION}",
+                where=work,
+                remedy="move the folder to another place, to begin again",
+            )
     policy.train()
     losses: list[float] = []
     wall, cpu = time.perf_counter(), time.process_time()
@@ -107,7 +117,7 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
         if step % config.save_every == 0 or step == config.steps:
             with replaced(work / "last.pt") as temporary:
                 parts = {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
-                torch.save({**parts, "step": step, "log": log}, temporary)
+                torch.save({**parts, "step": step, "log": log, "precision": PRECISION}, temporary)
     with replaced(out) as folder:
         for part in (policy, before, after):
             part.save_pretrained(folder)
@@ -123,7 +133,7 @@ def trained_with() -> dict[str, Any]:
     return {
         "packages": {name: version(name) for name in PACKAGES},
         "processors": processors,
-        "precision": "float32",
+        "precision": PRECISION,
     }
 
 

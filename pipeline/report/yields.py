@@ -109,7 +109,7 @@ def by_demonstration(tried: Rows) -> Table:
 
 
 def _largest_share(counts: Counter[str]) -> Cell:
-    return Cell(f"{max(counts.values()) / counts.total():.0%}".replace("%", " %") if counts else "-")
+    return Cell(f"{100 * max(counts.values()) / counts.total():.0f} %" if counts else "-")
 
 
 def _kept(counts: Counts) -> Cell:
