@@ -19,7 +19,7 @@ from pipeline.evaluation.goals import leave_out_trained_goals
 from pipeline.evaluation.model_server import warn_of_requests
 from pipeline.evaluation.policies import Policy
 from pipeline.evaluation.policy_config import PolicyConfig
-from pipeline.evaluation.results import EpisodeResult, one_setting
+from pipeline.evaluation.results import SUMMARY, EpisodeResult, one_setting
 from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.setting_checks import check_policy_settings, check_settings
@@ -113,7 +113,7 @@ def _write_summary(evaluation: Evaluation, selection: Selection, rows: Sequence[
         "selection": selection.model_dump(mode="json"),
         "settings": one_setting([(row, evaluation.files) for row in rows]) or evaluation.settings.model_dump(),
     }
-    outputs.write_json(evaluation.folder / "summary.json", summarised)
+    outputs.write_json(evaluation.folder / SUMMARY, summarised)
     # Other calls have written results of other tasks; equal settings are those of this call's results. A call without
     # any result does not know them, and leaves a table of the policy as it is.
     of_policy = [row for row in evaluation.files.rows() if row.identity == evaluation.identity]

@@ -17,6 +17,9 @@ from pipeline.files import is_temporary, read_json, write
 from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
+SUMMARY = "summary.json"
+"""File with an evaluation's summary, in its folder."""
+
 REJECTED = "refused"
 """Reason of an episode that could not begin, because its scene rejects the perturbation."""
 
@@ -136,13 +139,13 @@ class EpisodeFiles:
         Raises:
             PipelineError: if the folder is rejected; it names the folder or the file.
         """
-        outputs.reject_other_file(self.folder / "summary.json")
+        outputs.reject_other_file(self.folder / SUMMARY)
         outputs.reject_other_file(self.table)
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
         # An evaluation without results writes its summary, and may be killed after the video of its first episode.
         names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
-        if set(names) - {"summary.json", self.table.name, "videos", outputs.RECORD}:
+        if set(names) - {SUMMARY, self.table.name, "videos", outputs.RECORD}:
             raise PipelineError(
                 f"the folder has files but no results of an evaluation: {', '.join(sorted(names)[:3])}",
                 where=self.folder,

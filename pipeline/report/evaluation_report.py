@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline import outputs
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import Evaluated
+from pipeline.evaluation.results import SUMMARY, Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
 from pipeline.report import figures, pages
 from pipeline.report.evaluation_findings import FAILURES, findings
@@ -45,11 +45,18 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
         The paths of both files, and each policy's rate by source.
 
     Raises:
-        PipelineError: when ``path`` is not the name of an HTML file, or would overwrite a file of another origin.
+        PipelineError: when ``path`` is not the name of an HTML file, or a file of another origin or an evaluation's
+            summary would be overwritten.
     """
     if path.suffix != ".html":
         raise PipelineError("the report is an HTML page", where=path, expected="a name that ends in .html")
     json_path = path.with_suffix(".json")
+    if json_path.name == SUMMARY:
+        raise PipelineError(
+            "the page's JSON file would have the name of an evaluation's summary",
+            where=json_path,
+            remedy="choose another name for the page",
+        )
     outputs.reject_other_file(path)
     outputs.reject_other_file(json_path)
     found = findings(policies)

@@ -13,7 +13,7 @@ from episode_results import analyze, result
 from html_page import Page, needs_no_other_file, screenshot
 from scipy.stats import binomtest
 
-from pipeline import files
+from pipeline import files, outputs
 from pipeline.axes import level_of_test
 from pipeline.errors import PipelineError
 from pipeline.evaluation.analyses.grading import grade
@@ -306,3 +306,11 @@ def test_a_browser_shows_it(written: Path, width_px: int) -> None:
 def test_the_page_has_the_name_of_a_page(tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="the report is an HTML page"):
         evaluation_report.write([], tmp_path / "report.json")
+
+
+def test_the_page_leaves_an_evaluations_summary(tmp_path: Path) -> None:
+    summary = tmp_path / "summary.json"
+    outputs.write_json(summary, {"all": {}})
+    with pytest.raises(PipelineError, match="name of an evaluation's summary"):
+        evaluation_report.write([], tmp_path / "summary.html")
+    assert json.loads(summary.read_text()) == {"all": {}}
