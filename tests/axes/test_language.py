@@ -251,6 +251,13 @@ def test_distance_forgets_case_and_punctuation() -> None:
     assert level_of("would you be so kind as to see to the supper things", "put the bowl on it") == 5
 
 
+@pytest.mark.parametrize(("edits", "level"), [(50, 2), (60, 3), (67, 4), (72, 5)])
+def test_levels_begin_at_their_share_of_edited_characters(edits: int, level: Level) -> None:
+    original = 100 * "a"
+    assert level_of(edits * "b" + (100 - edits) * "a", original) == level
+    assert level_of((edits - 1) * "b" + (101 - edits) * "a", original) == level - 1
+
+
 @pytest.fixture(scope="module")
 def test() -> TestSet:
     return benchmark.load(REPOSITORY / benchmark.FOLDER)
