@@ -1,7 +1,7 @@
 """Statistics of relative actions by lerobot's own tool, compared with the definition.
 
 ROOT is a LeRobot dataset of a run with ``export.lerobot.action: absolute``; OUT is the copy that lerobot's tool wrote
-by the command in ``docs/formats-and-clients.md``:
+by the command in ``docs/clients.md``:
 
     python benchmarks/clients/relative_statistics.py ROOT OUT
 

@@ -64,7 +64,7 @@ IMAGES_NDIM = 4
 """Number of dimensions of an array of images (T, H, W, C)."""
 
 COMPRESSION: Mapping[str, Any] = {"compression": "gzip", "compression_opts": 1}
-"""Lossless compression of images, which HDF5 itself reads; ``docs/formats-and-clients.md`` has other levels."""
+"""Lossless compression of images, which HDF5 itself reads; ``docs/formats.md`` has other levels."""
 
 # LIBERO's longest demonstrations have about 500 steps. Without a limit, a few bytes of header could request all memory.
 _MAX_NUMBERS = 10_000_000

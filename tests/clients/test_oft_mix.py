@@ -83,7 +83,7 @@ WORDS = ["--mix", "libero_goal_no_noops=0.5", "--mix=libero_10_no_noops=1"]
 
 
 def trained(folder: Path, *words: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What the stand-in saw, and the statistics of its checkpoint, by the commands of docs/formats-and-clients.md."""
+    """What the stand-in saw, and the statistics of its checkpoint, by the commands of docs/clients.md."""
     for name, actions in ACTIONS.items():
         place = folder / ("libero" if name.endswith("_no_noops") else "data/rlds") / name / "1.0.0" / "actions.json"
         place.parent.mkdir(parents=True)

@@ -126,8 +126,9 @@ def printed_by_code_of(page: str, block: int, run: Path) -> str:
     code = re.findall(r"^```python\n(.*?)^```", (REPOSITORY / page).read_text(), re.MULTILINE | re.DOTALL)[block]
     for starter, tiny in (
         ("data/starter/lerobot/libero_perturbed", str(run / "lerobot" / "tiny")),
-        ("data/starter/rlds", str(run / "rlds")),
+        ("data/starter", str(run)),
         ("libero_perturbed_goal", "libero_tiny_goal"),
+        ('"background"', '"noise"'),
     ):
         code = code.replace(starter, tiny)
     assert "perturbed" not in code.replace('LeRobotDataset("libero_perturbed"', "")
@@ -138,14 +139,27 @@ def test_the_readmes_code_prints_an_episode_and_its_labels(finished: Path, rows:
     printed = printed_by_code_of("README.md", 0, finished)
     kept = [row for row in rows if row["kept"]]
     first = min(kept, key=lambda row: int(row["lerobot_episode_index"]))
-    assert all(first[label] in printed for label in ("instruction", "episode_id", "axis", "component"))
+    assert all(first[label] in printed for label in ("instruction", "episode_id", "axis", "component", "perturbations"))
     assert "observation.state torch.Size([8])" in printed
     assert "action torch.Size([7])" in printed
 
 
 @pytest.mark.parametrize("block", [0, 1])
 def test_the_code_of_the_page_on_formats_opens_the_datasets(finished: Path, block: int) -> None:
-    assert printed_by_code_of("docs/formats-and-clients.md", block, finished) == ""
+    assert printed_by_code_of("docs/formats.md", block, finished) == ""
+
+
+def test_the_code_of_the_page_on_formats_traces_an_episode(finished: Path, rows: list[dict[str, Any]]) -> None:
+    printed = printed_by_code_of("docs/formats.md", 2, finished)
+    row = next(row for row in rows if row["kept"] and row["axis"] == "noise")
+    assert json.dumps(json.loads(row["perturbations"]), indent=2) in printed
+    assert all(row[label] in printed for label in ("demo_id", "trajectory_id", "mujoco_version"))
+
+
+def test_the_code_of_the_page_on_clients_lists_the_chosen_episodes(finished: Path, rows: list[dict[str, Any]]) -> None:
+    printed = printed_by_code_of("docs/clients.md", 0, finished)
+    chosen = [row["lerobot_episode_index"] for row in rows if row["kept"] and row["axis"] in ("clean", "camera")]
+    assert json.loads(printed.removeprefix("--dataset.episodes=")) == sorted(chosen)
 
 
 def test_conventions(finished: Path, rows: list[dict[str, Any]]) -> None:
