@@ -35,8 +35,9 @@ SUMMARIZED = {
     "`ours`": ("no_state", "ours"),
     "`robots`": ("starts", "robots"),
     "`poses`": ("starts", "poses"),
-    "`all`, four scenes": ("object", "all"),
+    "`all`, object": ("object", "all"),
     "the same, twice the steps": ("object_long", "all"),
+    "`all`, spatial": ("spatial", "all"),
 }
 """Column of the summary to the further experiment and the arm that it compares with clean data."""
 

@@ -234,9 +234,10 @@ def test_the_page_shows_what_the_committed_rows_say(tmp_path: Path) -> None:
 
 
 def test_the_summary_has_the_differences_of_the_committed_rows() -> None:
-    """28 cells: four kinds of tests, in seven columns; computed from the files alone."""
-    folders = {"`all`": "axes", "`released`": "axes", "`ours`": "no_state", "`all`, four scenes": "object"}
+    """32 cells: four kinds of tests, in eight columns; computed from the files alone."""
+    folders = {"`all`": "axes", "`released`": "axes", "`ours`": "no_state", "`all`, object": "object"}
     folders |= {"`robots`": "starts", "`poses`": "starts", "the same, twice the steps": "object_long"}
+    folders["`all`, spatial"] = "spatial"
     arms = {"`released`": "released", "`ours`": "ours", "`robots`": "robots", "`poses`": "poses"}
     rows: list[list[str]] = []
     for line in comparison.summary().splitlines():
@@ -267,8 +268,8 @@ def test_the_summary_has_the_differences_of_the_committed_rows() -> None:
                 points = float(cells[place].strip("*"))
                 assert points == pytest.approx(100 * (rates[1] - rates[0]), abs=0.501), (cells[0], column)
                 compared += 1
-    assert compared == 28
-    assert perturbed[1:] == ["212", "212", "128", "128", "128", "32", "32"]
+    assert compared == 32
+    assert perturbed[1:] == ["212", "212", "128", "128", "128", "32", "32", "32"]
     # Holm's p of these cells: 0.014 and below 0.01; 0.15, 0.12 and 0.25.
     shown = {cells[0]: dict(zip(head, cells, strict=True)) for cells in lines}
     assert (shown["noise"]["`all`"], shown["robot"]["`all`"]) == ("**+31**", "**+33**")
