@@ -97,8 +97,9 @@ def evaluate(
 ) -> None:
     """Run a policy on LIBERO's tasks or your own, on LIBERO-Plus's test tasks or on held-out perturbations.
 
-    The command writes a file for each episode into DIR, summary.json with success rates and their 95 % intervals, and
-    episodes.csv with the success of each episode. The policy is a model server of vla-eval, which you start first, or a
+    The command writes a file for each episode into DIR. summary.json has the success rates of the episodes that this
+    call selects, with their 95 % intervals. episodes.csv has the success of each episode of the policy with the same
+    settings. The policy is a model server of vla-eval, which you start first, or a
     checkpoint of lerobot. A stopped evaluation resumes when the command is called again. For test tasks of LIBERO-Plus,
     the command prints the paper's table of this policy's results in DIR under these settings. It also writes the table
     into DIR as paper_table.md, .csv and .tex. The last line of the output is JSON.

@@ -66,7 +66,7 @@ def reject_other_actions(
             f"the server's actions cannot be executed: it announces {', '.join(unsupported)}",
             where=server,
             expected="position, axis-angle, and a gripper that opens below 0 and else closes",
-            remedy="start GR00T's server with --args.invert_gripper",
+            remedy="start GR00T's server with --args.invert_gripper true",
         )
     position = spec.get("position", {}).get("format")
     announced = "absolute" if params.get("absolute_action") or position == "absolute_xyz" else "delta"
