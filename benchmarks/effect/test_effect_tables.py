@@ -1,8 +1,9 @@
 """Tables of the experiment: rows as they were written, paired differences, exact p-values, and the pages."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ from scipy.stats import permutation_test
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult
+from pipeline.evaluation.statistics import Pair
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
+from pipeline.types import Floats
 
 EFFECT = Path(__file__).parent
 AXES = ("clean", "robot", "language", "pose", "camera", "noise")
@@ -45,7 +48,7 @@ def reading_row(scene: str, kind: str, asked: str | None, reached: str | None) -
 
 def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
     """Return results: of each axis the first ``solved`` of ten tasks, and one of two instructions, are solved."""
-    rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in AXES for number in range(10)]
+    rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis, number in product(AXES, range(10))]
     outcomes = [("own", "stove", "stove"), ("own", "put_the_bowl_on_the_plate", "stove"), ("nothing", None, "stove")]
     reading = [reading_row("stove", kind, asked, reached) for kind, asked, reached in outcomes]
     settings = {
@@ -211,6 +214,14 @@ def test_holms_correction() -> None:
     assert comparison.holm([0.03, 0.01, 1.0, 0.02]) == pytest.approx([0.06, 0.04, 1.0, 0.06])
 
 
+def solved_tests(policies: Sequence[results.PolicyResults]) -> Floats:
+    """Count, for each of the first ten tests (10,), the policies that solve it."""
+    counts = np.zeros(10)
+    for policy in policies:
+        counts += [episode.success for episode in policy.rows[:10]]
+    return counts
+
+
 def test_p_is_exact_where_few_tests_differ() -> None:
     """Two of the 2^5 signs are as extreme as five tests that favour one arm. SciPy permutes the arms of each test."""
     clean = [of_policy("clean", seed, 4) for seed in (0, 1)]
@@ -218,9 +229,11 @@ def test_p_is_exact_where_few_tests_differ() -> None:
     assert next(one for one in found if one["line"] == "robot")["p_value"] == 2 / 2**5
     for first, second in ((1, 8), (9, 3), (4, 4)):
         ours = [of_policy("ours", 0, first), of_policy("ours", 1, second)]
-        solved = [np.sum([[one.success for one in each.rows[:10]] for each in arm], axis=0) for arm in (clean, ours)]
+        solved = [solved_tests(clean), solved_tests(ours)]
         exact = permutation_test(solved, lambda a, b: (a - b).sum(), permutation_type="samples", n_resamples=2**10)
-        pairs = [pair for a, b in zip(clean, ours, strict=True) for pair in zip(a.rows[:10], b.rows[:10], strict=True)]
+        pairs: list[Pair] = []
+        for first_policy, second_policy in zip(clean, ours, strict=True):
+            pairs += zip(first_policy.rows[:10], second_policy.rows[:10], strict=True)
         assert comparison.sign_flip(pairs) == pytest.approx(exact.pvalue)
 
 

@@ -122,7 +122,10 @@ def test_tfds_reads_what_the_manifest_says(finished: Path, rows: list[dict[str, 
 
 
 def printed_by_code_of(page: str, block: int, run: Path) -> str:
-    """Return what a block of Python of a page prints, with the tests' run in place of ``data/starter``."""
+    """Return the output of a page's block of Python, with the tests' run in place of ``data/starter``.
+
+    The tests' run has noise, but no background.
+    """
     code = re.findall(r"^```python\n(.*?)^```", (REPOSITORY / page).read_text(), re.MULTILINE | re.DOTALL)[block]
     for starter, tiny in (
         ("data/starter/lerobot/libero_perturbed", str(run / "lerobot" / "tiny")),
